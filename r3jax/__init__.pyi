@@ -5,6 +5,7 @@ from .apps.forecast.expected_error import (
     expected_error,
     expected_error_images,
 )
+from .apps.forecast.forecast import is_done
 from .evaluation.evaluate import Evaluation, evaluate
 from .exploration.loop import Result, explore
 from .frame import Frame
@@ -17,9 +18,20 @@ from .mapping.state import MapState, empty_map
 from .mapping.update import integrate, integrate_points
 from .planning.decide import GreedyPolicy
 from .planning.next_views import NextViews, next_views
-from .planning.planner import Planner, decide, observe, start
-from .planning.policy import Decision
+from .planning.planner import (
+    Planner,
+    decide,
+    keep_out,
+    observe,
+    observe_points,
+    refuse,
+    start,
+    with_costmap,
+)
+from .planning.policy import Decision, DecisionOutcome
 from .planning.registry import make_policy, register_policy
+from .planning.robot.body import Body
+from .runs.saved_planner import load, save
 from .scoring.config import ScoringConfig
 from .scoring.explain import Explanation, explain_view
 from .scoring.panorama import Panorama, panorama
@@ -43,8 +55,10 @@ from .splatting.views import Views, load_views
 __version__: str
 
 __all__ = [
+    "Body",
     "Camera",
     "Decision",
+    "DecisionOutcome",
     "ErrorImages",
     "Evaluation",
     "ExpectedError",
@@ -81,6 +95,9 @@ __all__ = [
     "integrate",
     "integrate_depth",
     "integrate_points",
+    "is_done",
+    "keep_out",
+    "load",
     "load_views",
     "look_at",
     "lookup",
@@ -88,18 +105,22 @@ __all__ = [
     "merge",
     "next_views",
     "observe",
+    "observe_points",
     "open_scene",
     "panorama",
     "pose_along",
     "read_scene",
+    "refuse",
     "register_policy",
     "render",
     "renderability",
     "renderability_image",
+    "save",
     "soft_utility",
     "start",
     "view_utility",
     "voxel_difficulty",
     "voxel_renderability",
+    "with_costmap",
     "write_scene",
 ]

@@ -19,7 +19,7 @@ from collections.abc import Callable, Generator, Iterable
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-Kind = Literal["run", "team", "model", "training", "audit", "benchmark", "cell", "site"]
+Kind = Literal["run", "team", "model", "training", "audit", "benchmark", "cell", "site", "planner"]
 
 MARKER = ".r3jax"
 """Folder in a folder of ours."""
@@ -44,6 +44,7 @@ _MARKS: dict[Kind, tuple[tuple[str, tuple[bytes, ...]], ...]] = {
         ("cells/*/cell.json", (b'"exploration"', b'"test_views"')),
         ("photos/*.json", (b'"chooser"', b'"capture"')),
     ),
+    "planner": (("planner.json", (b'"r3jax-planner"',)),),
     "cell": (("cell.json", (b'"exploration"', b'"test_views"')),),
     "site": (
         ("index.html", (b'<meta name="generator" content="r3jax benchmark">',)),

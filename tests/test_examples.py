@@ -8,6 +8,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+import r3jax
+
 pytestmark = pytest.mark.full
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
@@ -33,3 +35,14 @@ def test_a_slam_stream_is_planned_for_and_mapped_again_when_its_poses_change(cap
     before = load("slam_stream").main(views=5, size=64)
     sunk = [a.position[2] - b.position[2] for a, b in zip(before, frames[:5], strict=True)]
     np.testing.assert_allclose(sunk, 0.01 * np.arange(5), atol=1e-5)
+
+
+def test_a_planar_robot_keeps_out_of_the_zone_and_its_map_is_saved(tmp_path):
+    robot = load("planar_robot")
+    track = np.array(robot.main(decisions=10, size=64, saved=tmp_path / "map"))
+    (low, _, high, _), body = np.array(robot.ZONE), 0.2
+    is_inside = np.all((track[:, :2] > low - body) & (track[:, :2] < high + body), axis=1)
+    assert not is_inside.any()
+    assert len(track) == 11
+    assert np.linalg.norm(np.diff(track, axis=0), axis=1).sum() > 2.0
+    assert int(r3jax.load(tmp_path / "map").map_state.num_occupied) > 1000

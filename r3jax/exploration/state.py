@@ -36,6 +36,9 @@ class StopReason(enum.Enum):
     NO_REACHABLE_CANDIDATE = "no-reachable-candidate"
     """The policy found candidates, but no safe path to any of them."""
 
+    SHUT_IN = "shut-in"
+    """The robot cannot leave its place: no path leads farther than a step."""
+
     STUCK = "stuck"
     """The policy has not moved for many views."""
 
@@ -56,6 +59,7 @@ COMPLETE = frozenset(
         StopReason.FORECAST,
         StopReason.NO_CANDIDATE,
         StopReason.NO_REACHABLE_CANDIDATE,
+        StopReason.SHUT_IN,
         StopReason.STUCK,
     )
 )

@@ -28,7 +28,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from r3jax.errors import InputError
 from r3jax.frame import Frame, a_frame
@@ -58,6 +58,9 @@ VOUCHED_LOG_ODDS = -1.5
 BLOCKS_ACROSS = 64
 """Blocks per image row: 8 pixels of a 512-pixel row, 9 cm at 5 m with 60 degrees of view."""
 
+KEEP_OUT, COSTMAP, REFUSED = 1, 2, 4
+"""Marks of cells: a zone that no robot may enter, an obstacle of a costmap, a goal not reached."""
+
 _OCTANTS = tuple((x, y, z) for x in (-0.25, 0.25) for y in (-0.25, 0.25) for z in (-0.25, 0.25))
 """Centers of a cell's octants, from its center, in cells."""
 
@@ -79,6 +82,26 @@ class OccupancyGrid(eqx.Module):
 
     explorable: Bool[Array, "X Y Z"] | None = None
     """Mask of the cells that count as unexplored while nothing is known of them; None: all."""
+
+    marks: UInt8[Array, "X Y Z"] | None = None
+    """What others say of the cells, whatever they hold: sums of `KEEP_OUT`, `COSTMAP` and
+    `REFUSED`; None: nothing."""
+
+    @property
+    def closed(self) -> Bool[np.ndarray, "X Y Z"] | None:
+        """Cells that no robot may enter: keep-out zones, a costmap's obstacles; None: no such."""
+        return None if self.marks is None else (np.asarray(self.marks) & (KEEP_OUT | COSTMAP)) > 0
+
+    @property
+    def refused(self) -> Bool[np.ndarray, "X Y Z"] | None:
+        """Cells round goals that a robot could not reach: it may pass, not stop; None: no such."""
+        return None if self.marks is None else (np.asarray(self.marks) & REFUSED) > 0
+
+    def marked(self, cells: Bool[Array | np.ndarray, "X Y Z"], mark: int) -> "OccupancyGrid":
+        """Sets one mark in some cells, and takes it from all others."""
+        before = np.zeros(self.log_odds.shape, np.uint8) if self.marks is None else self.marks
+        others = np.asarray(before) & np.uint8(255 - mark)
+        return replace(self, marks=jnp.asarray(others | np.where(cells, mark, 0).astype(np.uint8)))
 
     @property
     def free(self) -> Bool[Array, "X Y Z"]:
@@ -267,6 +290,41 @@ def integrate_depth(
     # Under jit nothing can be refused: NaN makes every later score say so.
     cell_size = grid.cell_size * nan_unless_valid(frame.camera, frame.T_world_camera)
     return eqx.tree_at(lambda g: (g.log_odds, g.cell_size), grid, (log_odds, cell_size))
+
+
+def integrate_rays(
+    grid: OccupancyGrid,
+    points: Float[np.ndarray, "n 3"],
+    sensors: Float[np.ndarray, "n 3"],
+    max_range: float,
+) -> OccupancyGrid:
+    """Updates the grid with one scan of a LiDAR; steps are those of `integrate_depth`.
+
+    A cell is hit by a point in it, and passed by a ray that runs through at least half a cell of
+    it and ends a quarter of a cell behind it. Hits outweigh passes. On the host.
+
+    Args:
+        grid: the grid before the scan.
+        points: where the rays ended [m]; farther than `max_range`: free up to there.
+        sensors: where they began [m].
+        max_range: of the sensor [m].
+    """
+    from r3jax.kernels.robot.cells import walk_rays
+
+    size, origin = float(grid.cell_size), np.asarray(grid.origin, np.float64)
+    distance = np.linalg.norm(points - sensors, axis=1)
+    is_hit = distance <= max_range
+    share = np.where(is_hit, 1.0, max_range / np.maximum(distance, 1e-9))
+    ends = sensors + share[:, None] * (points - sensors)
+    nearest = np.full(grid.log_odds.shape, np.inf)
+    kind = np.zeros(grid.log_odds.shape, np.int8)
+    walk_rays((sensors - origin) / size, (ends - origin) / size, is_hit, kind, nearest)
+    # Of a cell that several rays saw, the nearest look counts, as of an image.
+    far = np.where(np.isfinite(nearest), nearest * size, max_range)
+    step = STEP * np.clip(1.0 - STEP_DECAY * far, 0.0, 1.0)
+    change = np.where(kind == 2, step, np.where(kind == 1, -step, 0.0)).astype(np.float32)
+    log_odds = np.clip(np.asarray(grid.log_odds) + change, -LOG_ODDS_LIMIT, LOG_ODDS_LIMIT)
+    return replace(grid, log_odds=jnp.asarray(log_odds))
 
 
 def _hit_cells(

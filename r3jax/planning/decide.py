@@ -28,6 +28,7 @@ from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import Candidates, candidates_along, path_lengths, random_views
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo, Situation
+from r3jax.planning.robot.body import Body, room_for
 from r3jax.planning.robot.explorable import mask_unexplorable
 from r3jax.planning.robot.limits import Limits
 from r3jax.planning.robot.motion import Motion
@@ -38,6 +39,12 @@ from r3jax.scoring.utility import visible_unexplored
 MAX_FAILED_LOOKS = 3
 """A cell still unexplored after this many views that should have shown it is given up: it lies
 behind a window, where the depth sensor fails, or where hits and passes cancel out."""
+
+NEW_PLACE, NEW_DIRECTION = 1.0, 45.0
+"""A view this far from all others [m], or turned by so much [degrees], is a new one."""
+
+SHUT_IN_VIEWS, SHUT_IN_STEP = 6, 0.3
+"""A robot whose latest views all lie within such a step [m] is shut in, if no path leads out."""
 
 RECONSIDERED = 8
 """Candidates of an earlier decision that are scored again."""
@@ -64,6 +71,9 @@ class PlannerState(eqx.Module):
 
     memory: Any = None
     """Arrays that one policy keeps beside the map: a pytree of its own."""
+
+    taken: Float[np.ndarray, "V 6"] | None = None
+    """Positions and lines of sight of the views that were taken; None for a free-flying camera."""
 
 
 @dataclass(frozen=True)
@@ -237,6 +247,8 @@ def decide(
     with stopwatch.part("travel"):
         state, situation = look_round(*known, config)
     limits, travel = situation.limits, situation.travel
+    if state.taken is not None and is_shut_in(travel, state.taken):
+        return None, state, _nothing_in_reach(situation, config, stopwatch, is_shut_in=True)
 
     with stopwatch.part("candidates"):
         drawn = rule.draw(situation, key=draw_key)
@@ -245,7 +257,7 @@ def decide(
     state = replace(state, memory=drawn.memory)
     # No view on offer is an outcome, not an error: the loop ends with the reason.
     if not drawn.candidates.valid.any():
-        return None, state, _nothing_in_reach(travel, config, stopwatch)
+        return None, state, _nothing_in_reach(situation, config, stopwatch)
 
     with stopwatch.part("scoring"):
         # Before scoring, so that what is scored is what is taken; after it, because a score may
@@ -255,7 +267,8 @@ def decide(
         candidates = limits.project_to_feasible(candidates)
     if not candidates.valid.any():  # the policy has seen enough
         num = drawn.candidates.num_valid
-        info = PlanInfo(DecisionOutcome.NO_CANDIDATE, num, num, stopwatch.seconds)
+        reason = f"the policy has no use for any of {num} candidates: it has seen enough"
+        info = PlanInfo(DecisionOutcome.NO_CANDIDATE, num, num, stopwatch.seconds, reason)
         return None, state, info
 
     with stopwatch.part("travel"):
@@ -263,8 +276,13 @@ def decide(
         path = limits.path_costs(path_lengths(travel, candidates), candidates.direction)
     # What was drawn is within reach; what was drawn before the last view may not be.
     if not np.isfinite(path).any():
-        return None, state, _nothing_in_reach(travel, config, stopwatch)
+        return None, state, _nothing_in_reach(situation, config, stopwatch)
     utilities = utilities | {"path": path}
+    gain = utilities.get("utility")
+    if stands(config.motion) and state.taken is not None and gain is not None:
+        # Camera and floor tie such a robot to few views of a place: what they cannot show would
+        # draw it to where it is for as long as it runs.
+        utilities["utility"] = gain * novelty(candidates, state.taken)
     utilities = utilities | {"total": rule.weigh(utilities)}
 
     with stopwatch.part("travel"):
@@ -275,7 +293,8 @@ def decide(
     state = with_path(replace(state, memory=memory), travel, decision.waypoints)
     num_reachable = int(np.isfinite(path).sum())
     moved = (DecisionOutcome.MOVED, candidates.num_valid, num_reachable, stopwatch.seconds)
-    return decision, state, PlanInfo(*moved)
+    expected = None if gain is None else float(gain[best])
+    return decision, state, PlanInfo(*moved, expected_gain=expected)
 
 
 def look_round(
@@ -305,12 +324,17 @@ def look_round(
     motion, start = config.motion, state.start_height
     # Heights count from the first view, or a robot would creep up by its range each time.
     heights = motion.heights_from(0.0 if start is None else float(start))
-    travel = plan_travel(grid, pose[:3, 3], config.safety_margin, state.trail, heights, motion.body)
+    if stands(motion) and motion.is_relative and heights[0] == heights[1]:
+        heights = float(pose[2, 3]), float(pose[2, 3])  # on a ramp the floor carries it
+    travel = travel_of(motion.body, grid, map_state, pose, config, state, heights)
     # What this view should have shown: if it is still unexplored, the look has failed.
     visible = visible_unexplored(
         map_state, grid, state.camera, jnp.asarray(T_world_camera, jnp.float32), config.scoring
     )
     state = replace(state, looks=state.looks + np.asarray(visible, dtype=np.int32))
+    if state.taken is not None:
+        view = np.concatenate([pose[:3, 3], pose[:3, 2]]).astype(np.float32)[None]
+        state = replace(state, taken=np.concatenate([state.taken, view]))
     # After that many, more would not help, and the utility would never stop calling for them.
     is_exhausted = state.looks >= MAX_FAILED_LOOKS
     scoring_grid = mask_unexplorable(grid, travel.reachable, is_exhausted)
@@ -318,6 +342,41 @@ def look_round(
     return state, Situation(
         map_state, grid, scoring_grid, travel, state.camera, state.memory, limits
     )
+
+
+def novelty(candidates: Candidates, taken: np.ndarray) -> np.ndarray:
+    """How far candidates are from all views that were taken, [C]: 0 (the same) to 1.
+
+    Args:
+        candidates: views on offer.
+        taken: positions and unit lines of sight, [V, 6].
+    """
+    gap = np.linalg.norm(candidates.position[:, None] - taken[None, :, :3], axis=2) / NEW_PLACE
+    cosine = np.clip(candidates.axis @ taken[:, 3:].T.astype(np.float64), -1.0, 1.0)
+    turn = np.degrees(np.arccos(cosine)) / NEW_DIRECTION
+    return np.clip(np.hypot(gap, turn).min(axis=1, initial=1.0), 0.0, 1.0)
+
+
+def travel_of(
+    body: float | Body,
+    grid: OccupancyGrid,
+    map_state: MapState,
+    pose: np.ndarray,
+    config: PlannerConfig,
+    state: PlannerState,
+    heights: tuple[float, float],
+) -> Travel:
+    """Where a body can go from a pose [4, 4]: the form of `plan_travel` that its kind needs."""
+    position, trail = pose[:3, 3], state.trail
+    if not isinstance(body, Body):
+        return plan_travel(grid, position, config.safety_margin, trail, heights, body)
+    if body.heights is None:
+        return plan_travel(grid, position, body.needed, trail, heights)
+    present = np.asarray(map_state.present)
+    voxels = np.asarray(map_state.center).T[present].astype(np.float64)
+    size = float(map_state.voxel_size)
+    room = room_for(body, grid, voxels, size, pose, state.camera, trail)
+    return plan_travel(grid, position, trail=trail, heights=heights, room=room)
 
 
 def explain_path(
@@ -393,7 +452,9 @@ def initial_state(
     is_relative = motion is not None and motion.is_relative
     # NaN, not None, until the first view: the tree of arrays keeps its structure from there on.
     start_height = jnp.asarray(jnp.nan, dtype=jnp.float32) if is_relative else None
-    return PlannerState(camera, nowhere, looks, start_height, memory)
+    # A free camera has none, so that its memory stays as earlier versions stored it.
+    taken = None if motion is None or motion == Motion() else np.zeros((0, 6), np.float32)
+    return PlannerState(camera, nowhere, looks, start_height, memory, taken)
 
 
 def with_path(state: PlannerState, travel: Travel, waypoints: np.ndarray) -> PlannerState:
@@ -434,13 +495,94 @@ def _decision_for(
     )
 
 
-def _nothing_in_reach(travel: Travel, config: PlannerConfig, stopwatch: "Stopwatch") -> PlanInfo:
+def stands(motion: Motion) -> bool:
+    """True for a robot or a person with a footprint on the floor."""
+    return isinstance(motion.body, Body) and motion.body.heights is not None
+
+
+def is_shut_in(travel: Travel, taken: np.ndarray) -> bool:
+    """True if the latest views were all taken within a step, and no path leads farther.
+
+    Args:
+        travel: where the robot can go.
+        taken: positions and lines of sight of the views so far, [V, 6].
+    """
+    if len(taken) < SHUT_IN_VIEWS:
+        return False
+    latest = taken[-SHUT_IN_VIEWS:, :3]
+    if np.linalg.norm(latest - travel.start, axis=1).max() > SHUT_IN_STEP:
+        return False
+    stops = travel.stops(np.argwhere(travel.goals))
+    return bool(np.all(np.linalg.norm(stops - travel.start, axis=1) <= 2.0 * SHUT_IN_STEP))
+
+
+def _nothing_in_reach(
+    situation: Situation, config: PlannerConfig, stopwatch: "Stopwatch", *, is_shut_in: bool = False
+) -> PlanInfo:
     """Returns the answer where no candidate was found: safe places exist, or not even those."""
+    travel = situation.travel
     centers = travel.centers(np.argwhere(travel.safe))
     # Safe places within the radius that no path leads to are told from none at all.
     near = np.linalg.norm(centers - travel.start, axis=1) <= config.radius
-    reason = DecisionOutcome.NO_REACHABLE_CANDIDATE if near.any() else DecisionOutcome.NO_CANDIDATE
-    return PlanInfo(reason, num_candidates=int(near.sum()), stage_seconds=stopwatch.seconds)
+    outcome = DecisionOutcome.NO_REACHABLE_CANDIDATE if near.any() else DecisionOutcome.NO_CANDIDATE
+    if is_shut_in:
+        outcome = DecisionOutcome.SHUT_IN
+    reason, counts = explain_confinement(situation, config)
+    return PlanInfo(outcome, int(near.sum()), 0, stopwatch.seconds, reason, counts)
+
+
+def explain_confinement(situation: Situation, config: PlannerConfig) -> tuple[str, dict[str, int]]:
+    """Says what closes the space round the robot, in words and in numbers of cells or columns."""
+    travel, grid, body = situation.travel, situation.grid, config.motion.body
+    if not travel.contains(travel.start_cell):
+        counts = {"outside": 1}
+        return (
+            f"the camera at {travel.start.round(2).tolist()} m is outside of the bounds of the "
+            "planner: give `start` a box that holds the robot", counts,
+        )  # fmt: skip
+    extra: dict[str, int] = {}
+    reach = travel.room.needed if travel.room is not None else config.safety_margin
+    centers = np.moveaxis(np.indices(travel.free.shape), 0, -1)
+    gap = travel.origin + (centers + 0.5) * travel.cell_size - travel.start
+    near = np.linalg.norm(gap[..., :2], axis=-1) <= reach + 0.5
+    for name, cells in (("keep_out", grid.closed), ("refused_goals", grid.refused)):
+        if cells is not None and (near & cells).any():
+            extra[name] = int((near & cells).any(axis=2).sum())
+    if travel.room is not None:
+        counts = travel.room.counts | extra
+        assert isinstance(body, Body)
+        advice = (
+            "the camera never shows the floor: tilt it down, or allow "
+            "`Body(unknown_below=...)`, or raise the lowest part (`Body(heights=...)`)"
+            if counts["unknown"] > counts["obstacle"]
+            else "give a smaller footprint or margin, or move the robot to an open place"
+        )
+        reason = (
+            f"of {counts['near']} columns of cells within {reach + 0.5:.1f} m of the robot "
+            f"{counts['unknown']} are not known down to the floor and {counts['obstacle']} hold "
+            f"obstacles between {body.step:g} m above the floor and the top of its body; "
+            f"{counts['open']} are open: {advice}"
+        )  # fmt: skip
+        return _with_extra(reason, extra), counts
+    ball = np.linalg.norm(gap, axis=-1) <= reach + travel.cell_size
+    closed = ball & ~travel.free
+    occupied = int((closed & np.asarray(grid.occupied)).sum())
+    below = int((closed & (gap[..., 2] < -0.5 * travel.cell_size)).sum())
+    above = int((closed & (gap[..., 2] > 0.5 * travel.cell_size)).sum())
+    counts = {"near": int(ball.sum()), "not_free": int(closed.sum()), "occupied": occupied,
+              "below": below, "above": above} | extra  # fmt: skip
+    reason = (
+        f"of {counts['near']} cells within {reach:g} m of the camera {counts['not_free']} are not "
+        f"known to be free ({occupied} occupied, {below} below the camera, {above} above): is the "
+        "camera tilted, or low above the floor? Give the robot a footprint "
+        "(motion body=r3jax.Body(...)), or a smaller safety_margin"
+    )
+    return _with_extra(reason, extra), counts
+
+
+def _with_extra(reason: str, extra: dict[str, int]) -> str:
+    names = {"keep_out": "in keep-out zones or the costmap", "refused_goals": "near refused goals"}
+    return reason + "".join(f"; {num} columns are {names[name]}" for name, num in extra.items())
 
 
 @dataclass

@@ -19,6 +19,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
+from r3jax.errors import InputError
 from r3jax.frame import Frame, a_frame
 from r3jax.geometry.arguments import a_camera, a_pose, checked, one
 from r3jax.geometry.cameras import Camera
@@ -26,7 +27,17 @@ from r3jax.geometry.voxels import check_near_origin
 from r3jax.kernels.native.ahead import compile_ahead
 from r3jax.kernels.native.platform import is_cpu_only
 from r3jax.mapping.config import MappingConfig
-from r3jax.mapping.occupancy import OccupancyGrid, empty_grid, integrate_depth, mark_free_ball
+from r3jax.mapping.occupancy import (
+    COSTMAP,
+    KEEP_OUT,
+    REFUSED,
+    OccupancyGrid,
+    empty_grid,
+    integrate_depth,
+    integrate_rays,
+    mark_free_ball,
+    squared_distance,
+)
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.mapping.update import integrate_growing
 from r3jax.planning.decide import PlannerState
@@ -150,6 +161,154 @@ def decide(
         planner.policy_state, planner.map_state, planner.grid, pose, key=key
     )
     return decision, replace(planner, policy_state=policy_state), info
+
+
+@checked(planner=a_planner)
+def observe_points(
+    planner: Planner,
+    points: ArrayLike,
+    sensor_positions: ArrayLike,
+    *,
+    max_range: float | None = None,
+) -> Planner:
+    """Adds a scan of a LiDAR to the grid: free and occupied space, no surface to be scored.
+
+    Args:
+        planner: before the scan.
+        points: where rays ended, world, [n, 3] [m]. Rows that are not finite are left out; a point
+            beyond `max_range` says that its ray is free up to there.
+        sensor_positions: where they began, [3] or [n, 3] [m].
+        max_range: of the sensor [m]; None: that of the depth camera.
+
+    Raises:
+        ValueError: other shapes, or no positive range.
+    """
+    ends = np.asarray(points, np.float64)
+    if ends.ndim != 2 or ends.shape[1] != 3:
+        raise InputError(f"points must be [n, 3] in meters, got shape {ends.shape}")
+    begins = np.asarray(sensor_positions, np.float64)
+    if begins.shape not in ((3,), ends.shape):
+        raise InputError(
+            f"sensor_positions must be [3], or one for each of {len(ends)} points, got shape "
+            f"{begins.shape}"
+        )
+    reach = planner.config.max_range if max_range is None else max_range
+    if not 0.0 < reach < np.inf:
+        raise InputError(f"max_range must be positive and finite [m], got {max_range}")
+    begins = np.broadcast_to(begins, ends.shape)
+    is_sound = np.isfinite(ends).all(axis=1) & np.isfinite(begins).all(axis=1)
+    grid = integrate_rays(planner.grid, ends[is_sound], begins[is_sound], reach)
+    return replace(planner, grid=grid)
+
+
+@checked(planner=a_planner)
+def keep_out(planner: Planner, zones: Iterable[ArrayLike] | np.ndarray) -> Planner:
+    """Closes zones to the robot, in place of those of an earlier call; none: opens all of them.
+
+    No part of a footprint enters them; of a flying camera the middle does not.
+
+    Args:
+        planner: before.
+        zones: polygons, each [k, 2] corners in the world [m], k >= 3; or a mask of the grid's
+            columns, [X, Y] bool.
+
+    Raises:
+        ValueError: no polygon, or a mask of another shape.
+    """
+    shape = planner.grid.log_odds.shape
+    if isinstance(zones, np.ndarray) and zones.dtype == bool:
+        if zones.shape != shape[:2]:
+            raise InputError(f"the mask must be [X, Y] = {list(shape[:2])}, got {zones.shape}")
+        columns = zones
+    else:
+        columns = np.zeros(shape[:2], bool)
+        for zone in zones:
+            corners = np.asarray(zone, np.float64)
+            if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
+                raise InputError(
+                    f"a zone is a polygon of at least three corners [k, 2] in meters, got shape "
+                    f"{corners.shape}"
+                )
+            columns |= columns_in(planner.grid, corners)
+    cells = np.broadcast_to(columns[:, :, None], shape)
+    return replace(planner, grid=planner.grid.marked(cells, KEEP_OUT))
+
+
+@checked(planner=a_planner)
+def with_costmap(
+    planner: Planner,
+    data: ArrayLike,
+    resolution: float,
+    origin: ArrayLike,
+    *,
+    lethal: int = 100,
+) -> Planner:
+    """Closes what a costmap says is occupied, in place of an earlier one.
+
+    Args:
+        planner: before.
+        data: a `nav_msgs/OccupancyGrid`: [height, width], row by row along y, -1 (not known) or 0
+            to 100.
+        resolution: side of a pixel [m].
+        origin: x and y of the lower corner of pixel (0, 0), world [m]; without rotation.
+        lethal: from this value on a pixel is closed. Nav2 publishes 100 for obstacles and 99 for
+            where the robot's middle would touch them: with a footprint that is found here anyway.
+
+    Raises:
+        ValueError: another shape, or no positive resolution.
+    """
+    costs, corner = np.asarray(data), np.asarray(origin, np.float64)[:2]
+    if costs.ndim != 2:
+        raise InputError(
+            f"data must be [height, width], got shape {costs.shape}: reshape it with the message's "
+            "info.height and info.width"
+        )
+    if not 0.0 < resolution < np.inf:
+        raise InputError(f"resolution must be positive [m], got {resolution}")
+    y, x = np.nonzero(costs >= lethal)
+    # Both edges of a pixel: one that reaches into a cell closes it.
+    columns = np.zeros(planner.grid.log_odds.shape[:2], bool)
+    size, low = float(planner.grid.cell_size), np.asarray(planner.grid.origin, np.float64)[:2]
+    for dx, dy in ((0.01, 0.01), (0.01, 0.99), (0.99, 0.01), (0.99, 0.99)):
+        places = corner + resolution * np.stack([x + dx, y + dy], axis=1)
+        cells = np.floor((places - low) / size).astype(np.int64)
+        cells = cells[np.all((cells >= 0) & (cells < columns.shape), axis=1)]
+        columns[tuple(cells.T)] = True
+    cells = np.broadcast_to(columns[:, :, None], planner.grid.log_odds.shape)
+    return replace(planner, grid=planner.grid.marked(cells, COSTMAP))
+
+
+@checked(planner=a_planner)
+def refuse(planner: Planner, decision: Decision, radius: float = 0.5) -> Planner:
+    """Notes a goal that the robot could not reach: no goal near it is chosen again.
+
+    Paths may still lead past it.
+
+    Args:
+        planner: that decided on it, or a later one.
+        decision: what could not be done.
+        radius: how near is near [m].
+    """
+    goal = jnp.asarray(decision.T_world_camera[:3, 3], jnp.float32)
+    near = np.asarray(squared_distance(planner.grid, goal)) <= radius**2
+    before = planner.grid.refused
+    cells = near if before is None else near | before
+    return replace(planner, grid=planner.grid.marked(cells, REFUSED))
+
+
+def columns_in(grid: OccupancyGrid, corners: np.ndarray) -> np.ndarray:
+    """Columns of cells of which a polygon [k, 2] [m] holds some part, [X, Y] bool."""
+    size, origin = float(grid.cell_size), np.asarray(grid.origin, np.float64)
+    num = 4  # a zone thinner than a quarter of a cell may slip between these points
+    x, y = (
+        origin[i] + size / num * (np.arange(num * grid.log_odds.shape[i]) + 0.5) for i in range(2)
+    )
+    inside = np.zeros((len(x), len(y)), bool)
+    for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        if ay != by:  # the even-odd rule: each edge to the right of a point turns it over
+            crosses = (ay > y) != (by > y)
+            inside ^= crosses & (x[:, None] < ax + (y - ay) * (bx - ax) / (by - ay))
+    return inside.reshape(len(x) // num, num, len(y) // num, num).any(axis=(1, 3))
 
 
 def decide_ahead(

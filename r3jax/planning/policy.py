@@ -31,6 +31,9 @@ class DecisionOutcome(enum.Enum):
     NO_REACHABLE_CANDIDATE = "no-reachable-candidate"
     """Candidates were drawn, but no safe path leads to any of them."""
 
+    SHUT_IN = "shut-in"
+    """The latest goals all lay within a step of each other, and no path leads farther."""
+
 
 @dataclass(frozen=True)
 class Decision:
@@ -69,6 +72,16 @@ class PlanInfo:
     num_reachable: int = 0
     stage_seconds: dict[str, float] = field(default_factory=dict[str, float])
     """Wall time per part of the decision (`candidates`, `travel`, `scoring`) [s]."""
+
+    reason: str = ""
+    """Why there is no decision, and what to do; empty where there is one."""
+
+    limited_by: dict[str, int] = field(default_factory=dict[str, int])
+    """Where there is no decision: how many cells near the robot each limit closes."""
+
+    expected_gain: float | None = None
+    """What the chosen view is expected to add, in the policy's own measure (of R3: the utility U
+    before paths are weighed); None without a decision, and where a policy has no such measure."""
 
 
 @dataclass(frozen=True)

@@ -85,7 +85,7 @@ class CheckpointWriter:
             return False
         self.wait()  # it is done, but may have failed: this is where the loop hears of it
         # Orbax refuses a tree without leaves, such as the memory of a policy that keeps none.
-        tree = {name: _storable(table) for name, table in tables.items() if table}
+        tree = {name: to_storable(table) for name, table in tables.items() if table}
         self._under_way = self._thread.submit(self._write, step, tree)
         if wait:
             self.wait()
@@ -139,11 +139,11 @@ def load_checkpoint(folder: Path, step: int) -> dict[str, dict[str, np.ndarray]]
     # Orbax restores any tree; only two levels are tables of arrays.
     if not all(isinstance(table, dict) for table in tables.values()):
         raise RunError(path, "the checkpoint does not hold tables of arrays")
-    return {name: _stored(table) for name, table in tables.items()}
+    return {name: from_storable(table) for name, table in tables.items()}
 
 
-def _storable(table: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Returns Orbax refuses arrays without elements: their names say what they are."""
+def to_storable(table: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Replaces arrays without elements, which Orbax refuses, by names that say what they are."""
 
     def named(name: str, x: np.ndarray) -> str:
         return name if x.size else f"{name} empty {x.dtype.str} {list(x.shape)}"
@@ -151,8 +151,8 @@ def _storable(table: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {named(name, x): x if x.size else np.zeros(1, np.uint8) for name, x in table.items()}
 
 
-def _stored(table: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Returns the inverse of `_storable`."""
+def from_storable(table: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Undoes `to_storable`."""
     arrays: dict[str, np.ndarray] = {}
     for full_name, array in table.items():
         name, is_empty, rest = full_name.partition(" empty ")

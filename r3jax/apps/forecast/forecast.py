@@ -26,12 +26,14 @@ from scipy import ndimage
 from scipy.stats import qmc
 
 from r3jax.apps.forecast.psnr import Calibration, default_calibration, parse_goal, statistic
+from r3jax.errors import InputError
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.state import LoopState
 from r3jax.geometry.axis_views import LOOKS, poses_at
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
+from r3jax.planning.planner import Planner
 from r3jax.planning.robot.travel import safe_cells
 from r3jax.runs.reader import Run
 from r3jax.runs.settings import config_of
@@ -203,6 +205,28 @@ def stopping_rule(
         )
 
     return is_enough
+
+
+def is_done(planner: Planner, goal: str, camera: Camera | None = None) -> bool:
+    """Judges whether a planner has seen enough, by the rule of `explore --until`.
+
+    Not at every decision: it takes as long as scoring a hundred views.
+
+    Args:
+        planner: what is known.
+        goal: such as `psnr:25`, the mean of views all over the place [dB], or `psnr:20@p10`, all
+            but the worst tenth of them.
+        camera: of those views; None: the planner's.
+
+    Raises:
+        ValueError: a goal that is not understood; or a policy that does not say which camera it
+            plans for.
+    """
+    lens = getattr(planner.policy_state, "camera", None) if camera is None else camera
+    if not isinstance(lens, Camera):
+        raise InputError(f"the policy {planner.policy.name!r} keeps no camera: give camera=")
+    known = planner.map_state, planner.grid
+    return parse_goal(goal).reached(forecast_map(*known, lens, max_range=planner.config.max_range))
 
 
 _LEAST_GAIN = 0.1

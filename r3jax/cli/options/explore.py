@@ -22,6 +22,7 @@ from r3jax.cli.parsing import FieldsOf, settings_for
 from r3jax.errors import InputError
 from r3jax.exploration.config import LEAST_PIECE, ExplorationConfig, parse_budget
 from r3jax.planning.policies.foreign.commands import short_name
+from r3jax.planning.robot.body import Body
 from r3jax.planning.robot.motion import Motion, make_motion
 
 DEFAULT_POLICY = "r3-pano"
@@ -121,8 +122,11 @@ class MotionOptions:
     elevations: Annotated[tuple[float, float] | None, arg(metavar="LOW HIGH")] = None
     """Lowest and highest angle of the line of sight above the horizon [degrees]."""
 
+    footprint: Annotated[float | None, arg(metavar="RADIUS")] = None
+    """Radius of the robot or person on the floor [m]; it reaches up to the camera."""
+
     body: Annotated[float | None, arg(metavar="LENGTH")] = None
-    """Clearance that the robot needs below the camera [m]."""
+    """Instead of a footprint: clearance that is needed below the camera [m]."""
 
     speed: Annotated[float | None, arg(metavar="SPEED")] = None
     """Speed along the path [m/s]."""
@@ -141,6 +145,10 @@ class MotionOptions:
     def of_robot(self) -> Motion:
         """The preset with the options that are given."""
         given = settings_for(Motion, self)
+        if self.footprint is not None:
+            if self.body is not None:
+                raise InputError("--footprint and --body both say what must fit: give one")
+            given["body"] = Body(self.footprint)
         return make_motion(self.motion, **{k: v for k, v in given.items() if v is not None})
 
 

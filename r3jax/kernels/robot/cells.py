@@ -156,3 +156,54 @@ def nearest_in_ring(mask, middle, reach, cell_size, closest, farthest, most):
                 found[num, axis] = found[i, axis]
             num += 1
     return found[:num]
+
+
+@compiled_or_plain
+def walk_rays(starts, ends, is_hit, kind, nearest):
+    """Marks the cells that rays end in or pass (Amanatides and Woo 1987).
+
+    Args:
+        starts: where rays begin [cells], [n, 3].
+        ends: where they end [cells], [n, 3].
+        is_hit: whether there is something at the end, [n] bool.
+        kind: is set to 2 where a ray hits, else to 1 where one passes, [X, Y, Z] int8.
+        nearest: is lowered to the least distance from a start to such a cell [cells], [X, Y, Z].
+    """
+    for i in range(starts.shape[0]):
+        length = 0.0
+        for axis in range(3):
+            length += (ends[i, axis] - starts[i, axis]) ** 2
+        length = math.sqrt(length)
+        if not (0.0 < length < 1e6):  # NaN, too
+            continue
+        # What lies within a quarter of a cell before the hit is not passed.
+        last = length - 0.25 if is_hit[i] else length
+        t = 0.0
+        while t < last:
+            # Through the middle of the piece up to the next border: its cell, in any rounding.
+            piece = last - t
+            for axis in range(3):
+                d = (ends[i, axis] - starts[i, axis]) / length
+                if d != 0.0:
+                    here = starts[i, axis] + t * d
+                    border = (
+                        math.floor(here + 1e-9) + 1.0 if d > 0.0 else math.ceil(here - 1e-9) - 1.0
+                    )
+                    piece = min(piece, max((border - here) / d, 1e-9))
+            middle = t + 0.5 * piece
+            x = math.floor(starts[i, 0] + middle * (ends[i, 0] - starts[i, 0]) / length)
+            y = math.floor(starts[i, 1] + middle * (ends[i, 1] - starts[i, 1]) / length)
+            z = math.floor(starts[i, 2] + middle * (ends[i, 2] - starts[i, 2]) / length)
+            is_cell = (x >= 0) & (y >= 0) & (z >= 0)
+            is_cell &= (x < kind.shape[0]) & (y < kind.shape[1]) & (z < kind.shape[2])
+            if is_cell and piece >= 0.5:
+                kind[x, y, z] = max(kind[x, y, z], 1)
+                nearest[x, y, z] = min(nearest[x, y, z], middle)
+            t += piece
+        if is_hit[i]:
+            x, y, z = math.floor(ends[i, 0]), math.floor(ends[i, 1]), math.floor(ends[i, 2])
+            is_cell = (x >= 0) & (y >= 0) & (z >= 0)
+            is_cell &= (x < kind.shape[0]) & (y < kind.shape[1]) & (z < kind.shape[2])
+            if is_cell:
+                kind[x, y, z] = 2
+                nearest[x, y, z] = min(nearest[x, y, z], length)

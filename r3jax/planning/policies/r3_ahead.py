@@ -51,7 +51,7 @@ from r3jax.planning.config import PlannerConfig
 from r3jax.planning.decide import Drawn, GreedyPolicy, Scored
 from r3jax.planning.policy import Situation
 from r3jax.planning.robot.limits import Limits
-from r3jax.planning.robot.travel import Travel, segment_is_inside
+from r3jax.planning.robot.travel import Travel
 from r3jax.scoring.batch import cache_positions_near, score_cached_near
 from r3jax.scoring.gather import gather_in_range
 from r3jax.scoring.panorama_cache import PanoramaCache
@@ -279,13 +279,12 @@ def lengths_between(travel: Travel, positions: np.ndarray) -> np.ndarray:
     num = len(positions)
     # All pairs at once: a hundred positions are few.
     gap = np.linalg.norm(positions[:, None] - positions[None], axis=2)
-    scaled = travel.scaled(positions)
     direct = np.zeros((num, num))
     # Column 0 is the place itself, or a repeat of it.
     nearest = np.argsort(gap, axis=1, kind="stable")[:, 1 : _NEIGHBORS + 1]
     for i in range(num):
         for j in nearest[i]:
-            if direct[i, j] == 0.0 and segment_is_inside(travel.usable, scaled[i], scaled[j]):
+            if direct[i, j] == 0.0 and travel.in_reach(positions[i], positions[j][None])[0]:
                 direct[i, j] = direct[j, i] = max(gap[i, j], 1e-6)  # 0 means "no edge" to SciPy
     over = shortest_path(csr_matrix(direct), directed=False)
     # Back past the robot is always a way, though rarely a short one.

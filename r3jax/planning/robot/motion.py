@@ -9,6 +9,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
 from r3jax.errors import InputError
+from r3jax.planning.robot.body import Body
 from r3jax.validation.errors import did_you_mean
 
 UNLIMITED = (-math.inf, math.inf)
@@ -51,9 +52,10 @@ class Motion:
     """Lowest and highest angle of the line of sight above the horizon [deg]. A camera that can
     only turn round the vertical has one angle, the tilt of its mounting."""
 
-    body: float = 0.0
-    """What stands on the ground reaches so far down from the camera [m]: no cell there, nor
-    round it within the safety margin, may be known to be occupied."""
+    body: float | Body = 0.0
+    """What must fit where the camera goes. A number is the form of earlier versions: a ball of the
+    planner's `safety_margin`, all of it known free, and below it a cylinder that reaches so far
+    down [m], in which nothing may be known to be occupied."""
 
     speed: float | None = None
     """Along the path [m/s]; None: that of the loop's own settings, and turning takes no time."""
@@ -87,7 +89,7 @@ class Motion:
                 f"elevations must lie between -90 (straight down) and 90 degrees (straight up), "
                 f"got {_range(self.elevations)}"
             )
-        if not (math.isfinite(self.body) and self.body >= 0.0):
+        if not isinstance(self.body, Body) and not (math.isfinite(self.body) and self.body >= 0.0):
             raise InputError(f"body must be a finite length >= 0 [m], got {self.body}")
         for name in ("speed", "turn_rate", "turn_per_meter"):
             value = getattr(self, name)
@@ -133,12 +135,12 @@ class Motion:
 MOTIONS = {
     "free": Motion(),
     "ground": Motion(
-        heights=(0.0, 0.0), elevations=(0.0, 0.0), body=1.0, speed=0.5, turn_rate=60.0,
+        heights=(0.0, 0.0), elevations=(0.0, 0.0), body=Body(), speed=0.5, turn_rate=60.0,
         fixed_camera=True,
     ),
     "gimbal": Motion(elevations=(-90.0, 30.0), speed=1.0, turn_rate=90.0),
     "handheld": Motion(
-        heights=(-0.6, 0.4), elevations=(-60.0, 60.0), speed=0.5, turn_rate=45.0,
+        heights=(-0.6, 0.4), elevations=(-60.0, 60.0), body=Body(), speed=0.5, turn_rate=45.0,
         turn_per_meter=90.0, fixed_camera=True,
     ),
 }  # fmt: skip
@@ -186,8 +188,16 @@ def motion_of_record(record: Any) -> Motion:
     if not isinstance(record, dict | None):
         raise InputError(f"a motion must be an object with its settings, got {record!r}")
     # JSON has no tuples, and a list never equals one: `looks_anywhere` would be wrong.
-    plain = {k: tuple(v) if isinstance(v, list) else v for k, v in (record or {}).items()}
+    plain = _with_tuples(record or {})
+    if isinstance(plain.get("body"), dict):
+        plain["body"] = Body(**plain["body"])
     return make_motion("free", **plain)
+
+
+def _with_tuples(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _with_tuples(v) for k, v in value.items()}
+    return tuple(_with_tuples(v) for v in value) if isinstance(value, list) else value
 
 
 def motion_of(policy: object) -> Motion:

@@ -5,6 +5,9 @@ unknown space is an obstacle. With 0.2 m cells and 0.3 m margin these are the ce
 neighbors are free, so that every point of a path keeps at least one cell's width from
 anything that is not known to be free. The cell in which the robot stands is always usable.
 
+For a robot with a footprint (`body.Body`) a cell is safe if the footprint fits somewhere in it, by
+the plan that `body.room_for` draws. Paths are searched for and straight lines checked on that plan.
+
 Paths run over the 26-connected graph of usable cells. A diagonal step needs every cell of the
 block it crosses, so that it cannot squeeze between two corners. `skimage.graph.MCP_Geometric`
 cannot express that rule (tests compare the two), and SciPy's Dijkstra, for which the graph would
@@ -22,6 +25,7 @@ import numpy as np
 from r3jax.errors import InputError
 from r3jax.kernels.robot.shortest_paths import shortest_paths
 from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.planning.robot.body import Room
 from r3jax.planning.robot.motion import UNLIMITED, check_height
 
 _INSET = 1e-2
@@ -63,10 +67,17 @@ class Travel:
     [X, Y, Z] float64; inf where there is none."""
 
     previous: np.ndarray
-    """Flat index of the cell before each on that way, [X, Y, Z] int64; -1 at its start."""
+    """Flat index of the cell before each on that way, [X, Y, Z] int64; -1 at its start. Empty
+    where the room has the paths."""
 
     heights: tuple[float, float] = UNLIMITED
     """Lowest and highest place of the camera [m]: all waypoints lie between them."""
+
+    refused: np.ndarray | None = None
+    """Cells round goals that could not be reached, [X, Y, Z] bool; None: there are none."""
+
+    room: Room | None = None
+    """The plan in which a footprint moves; None: a sphere, for which `usable` is all there is."""
 
     @functools.cached_property
     def reachable(self) -> np.ndarray:
@@ -79,6 +90,8 @@ class Travel:
         goals = self.reachable & self.safe
         if self.contains(self.start_cell) and self.free[self.start_cell]:
             goals[self.start_cell] = True
+        if self.refused is not None:
+            goals = goals & ~self.refused
         return goals
 
     def contains(self, cell: tuple[int, int, int]) -> bool:
@@ -101,6 +114,12 @@ class Travel:
         At an allowed height.
         """
         places = self.centers(cells)
+        if self.room is not None:
+            x, y = np.moveaxis(np.asarray(cells)[..., :2], -1, 0)
+            stop = self.room.stop[x, y]
+            # Pixel 0 stands in where there is no stop, and is not used.
+            middles = self.room.places(np.maximum(stop, 0))
+            places[..., :2] = np.where((stop >= 0)[..., None], middles, places[..., :2])
         places[..., 2] = np.clip(places[..., 2], *self.heights)
         return places
 
@@ -121,21 +140,27 @@ class Travel:
         The straight line where it is safe, else the path over the cells' centers: no shorter
         than what `path` returns.
         """
-        from r3jax.kernels.robot.cells import segments_are_inside
-
         cells = np.floor((positions - self.origin) / self.cell_size).astype(np.int64)
         is_inside = np.all((cells >= 0) & (cells < self.usable.shape), axis=1)
         # Cell 0 stands in for those outside: a negative index would read from the far side.
         cells = np.where(is_inside[:, None], cells, 0)
         x, y, z = cells.T
         from_start = np.linalg.norm(self.stops(np.array(self.start_cell)) - self.start)
+        if self.room is not None:
+            from_start = 0.0  # the search began at the robot, not in the middle of its cell
         last = np.linalg.norm(positions - self.stops(cells), axis=1)
         lengths = np.where(is_inside, from_start + self.cost[x, y, z] + last, np.inf)
+        if self.room is not None:
+            # A footprint that fits somewhere in a cell may not fit everywhere.
+            stops = self.stops(cells)
+            for i in np.flatnonzero(np.isfinite(lengths)):
+                if not self.room.fits_along(stops[i], positions[i : i + 1])[0]:
+                    lengths[i] = np.inf
+            # Turning on the spot is no path.
+            lengths[np.linalg.norm(positions - self.start, axis=1) < 1e-6] = 0.0
         # The straight line where it is safe: no way is shorter, and `path` takes it too.
         near = np.flatnonzero(np.isfinite(lengths))
-        ends = self.scaled(positions[near])
-        is_straight = segments_are_inside(self.usable, self.scaled(self.start), ends)
-        straight = near[is_straight]
+        straight = near[self.in_reach(self.start, positions[near])]
         lengths[straight] = np.linalg.norm(positions[straight] - self.start, axis=1)
         return lengths
 
@@ -149,6 +174,12 @@ class Travel:
         cell = self.cell_of(goal)
         if not (self.contains(cell) and self.reachable[cell]):
             raise InputError(f"no safe path leads from {self.start} to {goal} (cell {cell})")
+        if self.room is not None:
+            middle = self.room.path(cell[:2])[1:]
+            middle = np.column_stack([middle, np.full(len(middle), goal[2])])
+            if np.linalg.norm(goal - self.start) < 1e-6:
+                middle = middle[:0]  # it turns on the spot
+            return self._shortcut(np.concatenate([self.start[None], middle, goal[None]]))
         # From the goal back to the robot: each cell knows only the one before it.
         way = [int(np.ravel_multi_index(cell, self.usable.shape))]
         previous = self.previous.reshape(-1)
@@ -186,8 +217,16 @@ class Travel:
             kept.append(ahead)
         return points[kept]
 
+    def in_reach(self, a: np.ndarray, ends: np.ndarray) -> np.ndarray:
+        """Whether straight lines from `a` [3] to ends [n, 3] [m] are safe throughout, [n] bool."""
+        from r3jax.kernels.robot.cells import segments_are_inside
+
+        if self.room is not None:
+            return self.room.fits_along(a, ends)
+        return segments_are_inside(self.usable, self.scaled(a), self.scaled(ends))
+
     def _sees(self, a: np.ndarray, b: np.ndarray) -> bool:
-        return segment_is_inside(self.usable, *self._in_cells(a, b))
+        return bool(self.in_reach(a, b[None])[0])
 
     def _in_cells(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self.scaled(a), self.scaled(b)
@@ -209,6 +248,7 @@ def plan_travel(
     trail: np.ndarray | None = None,
     heights: tuple[float, float] = UNLIMITED,
     body: float = 0.0,
+    room: Room | None = None,
 ) -> Travel:
     """Returns the shortest paths from a position to everywhere that is safe. Once per decision.
 
@@ -222,6 +262,7 @@ def plan_travel(
         heights: lowest and highest place of the camera [m], world.
         body: how far the robot extends down from the camera [m]
             (`cells_over_matter`).
+        room: of a robot with a footprint: it takes the place of `safety_margin` and `body`.
 
     Raises:
         ValueError: a position that is not finite, or not at an allowed height.
@@ -234,18 +275,31 @@ def plan_travel(
     if start.shape != (3,) or not np.all(np.isfinite(start)):
         raise InputError(f"the position must be three finite numbers [m], got {start}")
     check_height(float(start[2]), heights)
-    safe = safe_cells(free, cell_size, safety_margin)
+    if room is None:
+        safe = safe_cells(free, cell_size, safety_margin)
+    else:
+        safe = np.repeat(room.columns[:, :, None], free.shape[2], axis=2)
+    if grid.closed is not None:
+        safe &= ~grid.closed
     if heights != UNLIMITED:
         first, last = layers_between(heights, origin[2], cell_size, free.shape[2])
         # Closed layers, not clipped paths: the search itself must not leave the heights.
         safe[:, :, : max(first, 0)] = False
         safe[:, :, last + 1 :] = False
-    if body > 0.0:
+    if room is None and body > 0.0:
         occupied = np.asarray(grid.occupied)
         safe &= ~cells_over_matter(occupied, body, safety_margin, heights, origin[2], cell_size)
     cell = tuple(int(i) for i in np.floor((start - origin) / cell_size))
     is_inside = all(0 <= i < n for i, n in zip(cell, free.shape, strict=True))
     usable = safe
+    if room is not None:
+        # Searched for on the plan already; the layers that are open have the same paths.
+        cost = np.where(safe, room.cost[:, :, None], np.inf)
+        if is_inside:
+            cost[cell] = 0.0
+        usable, previous = safe | (cost == 0.0), np.zeros(0, np.int64)
+        return Travel(start, (cell[0], cell[1], cell[2]), origin, cell_size, free, safe, usable,
+                      cost, previous, heights, grid.refused, room)  # fmt: skip
     if is_inside and not safe[cell]:
         # Only a robot that is shut in gets more cells, and only those that it came through.
         usable = safe.copy()
@@ -265,6 +319,7 @@ def plan_travel(
         cost=cost * cell_size,
         previous=previous,
         heights=heights,
+        refused=grid.refused,
     )
 
 

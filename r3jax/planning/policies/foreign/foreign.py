@@ -10,7 +10,7 @@ Shape symbols: n frames; H W image size; X Y Z cells; C candidates.
 import itertools
 import operator
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import jax
@@ -150,7 +150,7 @@ class Foreign:
                 "bounds": [origin.tolist(), far.tolist()],
                 "cell_size": size,
                 "safety_margin": self.config.safety_margin,
-                "motion": vars(self.config.motion),
+                "motion": asdict(self.config.motion),
             },
         )
 

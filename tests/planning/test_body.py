@@ -1,0 +1,178 @@
+"""Laws of what a body with a footprint needs: room on the floor, and nothing in its way."""
+
+import itertools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
+
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.planning.robot.body import Body, Room, room_for
+from r3jax.planning.robot.motion import make_motion, motion_of_record
+from r3jax.planning.robot.travel import plan_travel
+from r3jax.runs.header import plain_settings
+
+CELL, VOXEL, SIZE = 0.2, 0.05, 4.0
+HEIGHT = 0.5
+SHAPE = (22, 22, 8)
+
+
+def grid_of(free: np.ndarray) -> OccupancyGrid:
+    log_odds = np.where(free, -3.0, 0.0).astype(np.float32)
+    origin = jnp.asarray([-CELL, -CELL, -CELL], jnp.float32)
+    return OccupancyGrid(jnp.asarray(log_odds), origin, jnp.asarray(CELL, jnp.float32))
+
+
+def all_free() -> np.ndarray:
+    free = np.zeros(SHAPE, bool)
+    free[1:-1, 1:-1, 1:] = True
+    return free
+
+
+def floor_voxels(height=lambda x, y: 0.0 * x) -> np.ndarray:
+    x, y = np.meshgrid(*[np.arange(0.025, SIZE, VOXEL)] * 2, indexing="ij")
+    z = (np.floor(height(x, y) / VOXEL + 1e-9) + 0.5) * VOXEL - VOXEL
+    return np.stack([x, y, z], axis=-1).reshape(-1, 3)
+
+
+def pole(x: float, y: float, low: float = 0.0, high: float = 1.0) -> np.ndarray:
+    z = np.arange(low + 0.5 * VOXEL, high, VOXEL)
+    return np.column_stack([np.full(len(z), x), np.full(len(z), y), z])
+
+
+def pose_at(x: float, y: float, z: float = HEIGHT) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]  # level, along x
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+def room_of(body: Body, voxels: np.ndarray, free: np.ndarray | None = None, at=(2.0, 2.0)) -> Room:
+    grid = grid_of(all_free() if free is None else free)
+    return room_for(body, grid, voxels, VOXEL, pose_at(*at))
+
+
+poles = st.lists(
+    st.tuples(st.integers(2, 77), st.integers(2, 77)).map(lambda p: (p[0] + 0.5, p[1] + 0.5)),
+    min_size=1,
+    max_size=12,
+)
+
+
+@given(poles=poles, radius=st.floats(0.1, 0.4), goal=st.tuples(*[st.floats(0.2, 3.8)] * 2))
+@settings(max_examples=40, deadline=None)
+def test_no_point_of_a_footprint_comes_into_an_obstacle(poles, radius, goal):
+    """Of a path, wherever it leads; the oracle is a search tree over the obstacles' corners."""
+    places = np.array(poles) * VOXEL
+    places = places[np.linalg.norm(places - 2.0, axis=1) > radius + 0.15]
+    voxels = np.concatenate([floor_voxels(), *[pole(x, y) for x, y in places]])
+    room = room_of(Body(radius), voxels)
+    height = (HEIGHT, HEIGHT)
+    travel = plan_travel(grid_of(all_free()), pose_at(2, 2)[:3, 3], heights=height, room=room)
+    end = np.array([*goal, HEIGHT])
+    (length,) = travel.lengths(end[None])
+    if not np.isfinite(length) or not len(places):
+        return
+    path = travel.path(end)
+    np.testing.assert_array_equal(path[[0, -1], :2], [[2.0, 2.0], end[:2]])
+    assert np.linalg.norm(np.diff(path, axis=0), axis=1).sum() <= length + 1e-6
+    t = np.linspace(0.0, 1.0, 60)[:, None]
+    points = np.concatenate([a + t * (b - a) for a, b in itertools.pairwise(path)])
+    offsets = np.array([(i, j) for i in (-0.5, 0.5) for j in (-0.5, 0.5)]) * VOXEL
+    corners = (places[:, None] + offsets).reshape(-1, 2)
+    assert cKDTree(corners).query(points[:, :2])[0].min() >= radius
+
+
+@given(radius=st.floats(0.1, 0.35), gap=st.floats(0.3, 1.2))
+@settings(max_examples=30, deadline=None)
+def test_a_door_is_passed_if_it_is_wide_enough(radius, gap):
+    """With the margin, and at most two voxels of the map to spare."""
+    y = np.arange(0.025, SIZE, VOXEL)
+    wall = [pole(3.025, v) for v in y if abs(v - 2.0) > 0.5 * gap]
+    room = room_of(Body(radius), np.concatenate([floor_voxels(), *wall]))
+    is_beyond = np.isfinite(room.cost[18:21]).any()
+    needed = 2.0 * (radius + 0.05)
+    if gap > needed + 0.2:
+        assert is_beyond
+    if gap < 2.0 * radius:
+        assert not is_beyond
+
+
+def test_ramps_and_a_noisy_floor_are_no_obstacles_but_steps_are():
+    ramp = floor_voxels(lambda x, y: np.maximum(0.0, x - 2.5) * np.tan(np.radians(12.0)))
+    noisy = floor_voxels()
+    noisy[:, 2] += VOXEL * np.random.default_rng(0).integers(0, 2, len(noisy))
+    step = floor_voxels(lambda x, y: np.where(x > 3.0, 0.3, 0.0))
+    free = all_free()
+    for name, voxels, is_open in (
+        ("ramp", ramp, True),
+        ("noisy", noisy, True),
+        ("step", step, False),
+    ):
+        room = room_of(Body(0.2), voxels, free)
+        assert np.isfinite(room.cost[18, 6:15]).any() == is_open, name
+
+
+def test_what_is_above_the_body_or_no_higher_than_a_step_is_passed():
+    y = np.arange(0.025, SIZE, VOXEL)
+    for low, high, is_open in (
+        (0.0, 0.1, True),
+        (0.6, 1.0, True),
+        (0.0, 0.2, False),
+        (0.4, 0.6, False),
+    ):
+        bar = [pole(3.025, v, low, high) for v in y]
+        room = room_of(Body(0.2), np.concatenate([floor_voxels(), *bar]))
+        assert np.isfinite(room.cost[18:21]).any() == is_open, (low, high)
+
+
+def test_unknown_cells_below_the_camera_count_as_the_policy_says():
+    free = all_free()
+    free[:, :, :2] = False  # nothing is known of the lowest layer, but for the floor's voxels
+    seen = floor_voxels()
+    near_and_far = seen[(seen[:, 0] > 2.8) | (seen[:, 0] < 1.0)]
+    camera_less = lambda policy, voxels: room_of(Body(0.2, unknown_below=policy), voxels, free)
+    assert np.isfinite(camera_less("free", seen).cost[18]).any()
+    assert not np.isfinite(camera_less("never", near_and_far).cost[18]).any()
+    assert not np.isfinite(camera_less("free", near_and_far).cost[18]).any()
+
+
+def test_a_thin_thing_that_the_map_does_not_hold_is_an_obstacle():
+    log_odds = np.array(grid_of(all_free()).log_odds)
+    log_odds[16, :, 2] = 3.0
+    grid = OccupancyGrid(
+        jnp.asarray(log_odds), jnp.full(3, -CELL, jnp.float32), jnp.asarray(CELL, jnp.float32)
+    )
+    room = room_for(Body(0.2), grid, floor_voxels(), VOXEL, pose_at(2.0, 2.0))
+    assert not np.isfinite(room.cost[18:]).any()
+
+
+def test_a_polygon_needs_the_room_to_turn():
+    square = Body(((0.3, 0.2), (0.3, -0.2), (-0.3, -0.2), (-0.3, 0.2)))
+    assert square.radius == pytest.approx(np.hypot(0.3, 0.2))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"footprint": 0.0},
+        {"footprint": ((0.0, 0.0), (1.0, 0.0))},
+        {"footprint": float("nan")},
+        {"heights": (0.5, 0.2)},
+        {"margin": -0.1},
+        {"unknown_below": "maybe"},
+    ],
+)
+def test_a_body_that_cannot_be_is_refused_by_name(settings):
+    with pytest.raises(ValueError, match=next(iter(settings)).split("_")[0]):
+        Body(**settings)
+
+
+def test_a_recorded_motion_has_its_body_again():
+    body = Body(((0.3, 0.2), (0.3, -0.2), (-0.3, 0.0)), heights=(0.0, 0.9), unknown_below="never")
+    motion = make_motion("ground", body=body)
+    assert motion_of_record(plain_settings(motion)) == motion
+    assert motion_of_record({"body": 1.0}).body == 1.0  # of earlier versions
