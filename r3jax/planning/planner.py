@@ -8,7 +8,7 @@
 is immutable: the one before a call is still what it was.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -202,7 +202,7 @@ def observe_points(
 
 
 @checked(planner=a_planner)
-def keep_out(planner: Planner, zones: Iterable[ArrayLike] | np.ndarray) -> Planner:
+def keep_out(planner: Planner, zones: Iterable[Any] | np.ndarray) -> Planner:
     """Closes zones to the robot, in place of those of an earlier call; none: opens all of them.
 
     No part of a footprint enters them; of a flying camera the middle does not.
@@ -239,7 +239,7 @@ def with_costmap(
     planner: Planner,
     data: ArrayLike,
     resolution: float,
-    origin: ArrayLike,
+    origin: Sequence[float] | np.ndarray,
     *,
     lethal: int = 100,
 ) -> Planner:
@@ -308,7 +308,7 @@ def columns_in(grid: OccupancyGrid, corners: np.ndarray) -> np.ndarray:
         if ay != by:  # the even-odd rule: each edge to the right of a point turns it over
             crosses = (ay > y) != (by > y)
             inside ^= crosses & (x[:, None] < ax + (y - ay) * (bx - ax) / (by - ay))
-    return inside.reshape(len(x) // num, num, len(y) // num, num).any(axis=(1, 3))
+    return np.asarray(inside.reshape(len(x) // num, num, len(y) // num, num).any(axis=(1, 3)))
 
 
 def decide_ahead(

@@ -163,7 +163,6 @@ def test_a_polygon_needs_the_room_to_turn():
         {"footprint": float("nan")},
         {"heights": (0.5, 0.2)},
         {"margin": -0.1},
-        {"unknown_below": "maybe"},
     ],
 )
 def test_a_body_that_cannot_be_is_refused_by_name(settings):

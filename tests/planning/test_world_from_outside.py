@@ -129,7 +129,7 @@ def test_a_refused_goal_is_left_alone():
 
 def test_lidar_frees_what_rays_pass_and_closes_where_they_end():
     planner = r3jax.start(CAMERA, BOUNDS, "random")
-    angle = np.linspace(0, 2 * np.pi, 720, endpoint=False)
+    angle = np.linspace(0, 2 * np.pi, 720, endpoint=False) + 1e-3
     sensor = np.array([2.0, 1.5, 0.5])
     direction = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
     # A box room: the nearest wall along each ray.

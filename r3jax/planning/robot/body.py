@@ -18,6 +18,7 @@ On the host: NumPy and SciPy. Shape symbols: X Y Z cells; x y pixels of the plan
 """
 
 import functools
+import itertools
 import math
 from dataclasses import dataclass, field
 from typing import Literal
@@ -182,7 +183,7 @@ class Room:
         # The start itself is not asked: the robot stands there.
         num = max(int(np.ceil(np.linalg.norm(gap, axis=1).max() / (0.5 * self.pixel))), 1)
         shares = np.arange(1, num + 1) / num
-        return self.fits(start[:2] + shares[:, None, None] * gap).all(axis=0)
+        return np.asarray(self.fits(start[:2] + shares[:, None, None] * gap).all(axis=0))
 
 
 def room_for(
@@ -283,6 +284,9 @@ class _Known:
         size, origin = float(grid.cell_size), np.asarray(grid.origin, np.float64)
         free, occupied = np.asarray(grid.free), np.asarray(grid.occupied)
         shape, position = free.shape, np.asarray(T_world_camera, np.float64)[:3, 3]
+        # What is higher than any body can be no obstacle, and no floor.
+        tallest = position[2] + (body.heights[1] or 0.0) + size
+        voxels = voxels[voxels[:, 2] < tallest]
         cells = np.floor((voxels - origin) / size).astype(np.int64)
         inside = np.all((cells >= 0) & (cells < shape), axis=1)
         voxels, cells = voxels[inside], cells[inside]
@@ -298,7 +302,9 @@ class _Known:
         # At least one layer counts, however thin the body is.
         thickest = overlap.max(axis=2, keepdims=True)
         within = overlap > np.minimum(_OVERLAP * size, 0.99 * thickest)
-        been = np.zeros(shape[:2], bool) if trail is None else np.asarray(trail).any(axis=2)
+        been = np.zeros(shape[:2], bool)
+        if trail is not None:
+            been |= np.asarray(trail).any(axis=2)
         own = _column(position, origin, size)
         if np.all((own >= 0) & (own < shape[:2])):
             been[tuple(own)] = True
@@ -310,18 +316,20 @@ class _Known:
     def obstacles(self) -> np.ndarray:
         """Centers of voxels that the body would touch, [n, 3] [m]."""
         top = self.top[self.cells[:, 0], self.cells[:, 1]]
-        # A quarter of a voxel of grace: the floor's own level is no better known.
-        is_above = self.above > self.low + 0.25 * self.voxel_size
+        # A tenth of a voxel of grace: the floor itself is known no better.
+        is_above = self.above > self.low + 0.1 * self.voxel_size
         return self.voxels[is_above & (self.voxels[:, 2] - 0.5 * self.voxel_size < top)]
 
     @functools.cached_property
     def has_voxel(self) -> np.ndarray:
         """Cells into which a voxel reaches, [X, Y, Z] bool."""
         found, last = np.zeros(self.free.shape, bool), np.array(self.free.shape) - 1
-        for corner in np.ndindex(2, 2, 2):
-            corners = self.voxels + (np.array(corner) - 0.5) * self.voxel_size
-            index = np.floor((corners - self.origin) / self.size).astype(np.int64)
-            found[tuple(np.clip(index, 0, last).T)] = True
+        low, high = (
+            np.clip(np.floor((self.voxels + half - self.origin) / self.size), 0, last).astype(int)
+            for half in (-0.5 * self.voxel_size, 0.5 * self.voxel_size)
+        )
+        for x, y, z in itertools.product((low, high), repeat=3):
+            found[x[:, 0], y[:, 1], z[:, 2]] = True
         return found
 
     def thin_obstacles(self) -> np.ndarray:
@@ -350,10 +358,11 @@ class _Known:
         # Round obstacles, not through them: what hides behind a table is not the blind spot.
         near, square = _dilated(self.been, radius), np.ones((3, 3), bool)
         for i in range(int(np.ceil(blind / self.size / 0.85))):
-            near = ndimage.binary_dilation(near, None if i % 2 else square, mask=~hit)
+            near = np.asarray(ndimage.binary_dilation(near, None if i % 2 else square, mask=~hit))
         gap = 0.5 * blind / self.size + 1.0
         pad = int(np.ceil(gap)) + 1
-        around = ndimage.binary_closing(np.pad(known, pad), _disk(gap))[pad:-pad, pad:-pad]
+        closed = np.asarray(ndimage.binary_closing(np.pad(known, pad), _disk(gap)))
+        around = closed[pad:-pad, pad:-pad]
         return known | (near & around & ~thin)
 
 
@@ -422,8 +431,9 @@ def _floor_map(
     low = np.floor(origin[2] / voxel_size)
     num = int(np.ceil(shape[2] * size / voxel_size)) + 2
     level = np.clip(np.floor(voxels[:, 2] / voxel_size) - low, 0, num - 1).astype(np.int64)
-    filled = np.zeros((*shape[:2], num), bool)
-    filled[cells[:, 0], cells[:, 1], level] = True
+    # How many, not whether any: a stray voxel of noise must not lift the floor.
+    filled = np.zeros((*shape[:2], num))
+    np.add.at(filled, (cells[:, 0], cells[:, 1], level), 1.0)
     heights = (low + np.arange(num) + 0.5) * voxel_size
     floor = np.full(shape[:2], np.nan)
     x, y = np.clip(_column(position, origin, size), 0, np.array(shape[:2]) - 1)
@@ -442,9 +452,9 @@ def _floor_map(
         new = ~is_known & (count > 0)
         i, j = np.nonzero(new)
         expected = near(values)[new] / count[new]
-        is_near = filled[i, j] & (np.abs(heights - expected[:, None]) <= 1.3 * voxel_size)
-        total = is_near.sum(axis=1)
-        found = (is_near * heights).sum(axis=1) / np.maximum(total, 1)
+        weight = filled[i, j] * (np.abs(heights - expected[:, None]) <= 1.3 * voxel_size)
+        total = weight.sum(axis=1)
+        found = (weight * heights).sum(axis=1) / np.maximum(total, 1.0)
         floor[i, j] = np.where(total > 0, found, expected)
     return np.where(np.isnan(floor), start, floor)
 

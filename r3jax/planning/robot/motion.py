@@ -140,7 +140,7 @@ MOTIONS = {
     ),
     "gimbal": Motion(elevations=(-90.0, 30.0), speed=1.0, turn_rate=90.0),
     "handheld": Motion(
-        heights=(-0.6, 0.4), elevations=(-60.0, 60.0), body=Body(), speed=0.5, turn_rate=45.0,
+        heights=(-0.6, 0.4), elevations=(-60.0, 60.0), speed=0.5, turn_rate=45.0,
         turn_per_meter=90.0, fixed_camera=True,
     ),
 }  # fmt: skip

@@ -118,7 +118,7 @@ class Travel:
             x, y = np.moveaxis(np.asarray(cells)[..., :2], -1, 0)
             stop = self.room.stop[x, y]
             # Pixel 0 stands in where there is no stop, and is not used.
-            middles = self.room.places(np.maximum(stop, 0))
+            middles = self.room.places(np.asarray(np.maximum(stop, 0)))
             places[..., :2] = np.where((stop >= 0)[..., None], middles, places[..., :2])
         places[..., 2] = np.clip(places[..., 2], *self.heights)
         return places
