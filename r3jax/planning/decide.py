@@ -345,7 +345,7 @@ def look_round(
 
 
 def novelty(candidates: Candidates, taken: np.ndarray) -> np.ndarray:
-    """How far candidates are from all views that were taken, [C]: 0 (the same) to 1.
+    """Measures how new candidates are beside all views that were taken, [C]: 0 (the same) to 1.
 
     Args:
         candidates: views on offer.
@@ -366,7 +366,7 @@ def travel_of(
     state: PlannerState,
     heights: tuple[float, float],
 ) -> Travel:
-    """Where a body can go from a pose [4, 4]: the form of `plan_travel` that its kind needs."""
+    """Finds where a body can go from a pose [4, 4], in the form that its kind needs."""
     position, trail = pose[:3, 3], state.trail
     if not isinstance(body, Body):
         return plan_travel(grid, position, config.safety_margin, trail, heights, body)
@@ -496,12 +496,12 @@ def _decision_for(
 
 
 def stands(motion: Motion) -> bool:
-    """True for a robot or a person with a footprint on the floor."""
+    """Tells a robot or a person with a footprint on the floor from what flies."""
     return isinstance(motion.body, Body) and motion.body.heights is not None
 
 
 def is_shut_in(travel: Travel, taken: np.ndarray) -> bool:
-    """True if the latest views were all taken within a step, and no path leads farther.
+    """Checks if the latest views were all taken within a step, and no path leads farther.
 
     Args:
         travel: where the robot can go.

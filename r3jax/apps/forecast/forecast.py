@@ -214,7 +214,7 @@ def is_done(planner: Planner, goal: str, camera: Camera | None = None) -> bool:
 
     Args:
         planner: what is known.
-        goal: such as `psnr:25`, the mean of views all over the place [dB], or `psnr:20@p10`, all
+        goal: such as `psnr:25`, the mean of views throughout the place [dB], or `psnr:20@p10`, all
             but the worst tenth of them.
         camera: of those views; None: the planner's.
 

@@ -169,14 +169,14 @@ class Room:
         return self.places(np.array(pixels[::-1]))
 
     def fits(self, points: np.ndarray) -> np.ndarray:
-        """Whether the body fits at points [..., 2 or 3] [m]."""
+        """Checks if the body fits at points [..., 2 or 3] [m]."""
         index = np.floor((points[..., :2] - self.origin) / self.pixel).astype(np.int64)
         is_inside = np.all((index >= 0) & (index < self.distance.shape), axis=-1)
         x, y = np.moveaxis(np.where(is_inside[..., None], index, 0), -1, 0)
         return is_inside & (self.distance[x, y] >= self.needed)
 
     def fits_along(self, start: np.ndarray, ends: np.ndarray) -> np.ndarray:
-        """Whether the body fits everywhere on the straight lines to ends [n, 3] [m], [n] bool."""
+        """Checks if the body fits everywhere on the straight lines to ends [n, 3] [m], [n] bool."""
         gap = ends[:, :2] - start[:2]
         if not len(gap):
             return np.zeros(0, bool)
