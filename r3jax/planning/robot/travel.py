@@ -218,7 +218,7 @@ class Travel:
         return points[kept]
 
     def in_reach(self, a: np.ndarray, ends: np.ndarray) -> np.ndarray:
-        """Checks if straight lines from `a` [3] to ends [n, 3] [m] are safe throughout, [n] bool."""
+        """Checks if straight lines from `a` [3] to ends [n, 3] [m] are safe, [n] bool."""
         from r3jax.kernels.robot.cells import segments_are_inside
 
         if self.room is not None:
