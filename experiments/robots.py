@@ -230,6 +230,7 @@ def drive(
         "reachable_m2": float(reachable.sum() * PIXEL**2),
         "meters": float(np.sum(goals)),
         "nearest": nearest,
+        "nearest_at": track[np.argmin(plan.at(track))].round(3).tolist(),
         # Half a diagonal of a pixel is what the plan itself may be wrong by.
         "collides": bool(nearest < robot.footprint - 0.75 * PIXEL),
         "decide_median": float(np.median(seconds)),

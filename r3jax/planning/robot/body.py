@@ -363,7 +363,7 @@ class _Known:
         pad = int(np.ceil(gap)) + 1
         closed = np.asarray(ndimage.binary_closing(np.pad(known, pad), _disk(gap)))
         around = closed[pad:-pad, pad:-pad]
-        return known | (near & around & ~thin)
+        return known | (np.asarray(near, bool) & np.asarray(around, bool) & ~thin)
 
 
 def _search(
