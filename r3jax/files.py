@@ -81,7 +81,7 @@ class _Opened(NamedTuple):
     handle: int | None
 
     def at(self, name: str) -> str:
-        """Returns what names a file in it, for calls that are given the handle, too."""
+        """Returns the name of a file in it, also for calls that are given the handle."""
         return name if self.handle is not None else str(self.path / name)
 
 
@@ -125,12 +125,12 @@ def is_link(path: Path) -> bool:
 
 
 def _marked(folder: Path) -> list[Path]:
-    """Returns the folders of ours that a folder lies in, itself first."""
+    """Finds the folders of ours that contain a folder, itself first."""
     return [at for at in (folder, *folder.parents) if kind_of(at) is not None]
 
 
 def kind_of(folder: Path) -> str | None:
-    """Returns the kind of a folder of ours, by its marker; None without one."""
+    """Reads the kind of a folder of ours from its marker; None without one."""
     note = folder / MARKER / _NOTE
     try:
         descriptor = os.open(note, os.O_RDONLY | _NO_LINK | getattr(os, "O_NONBLOCK", 0))
@@ -167,7 +167,7 @@ def check_own(folder: Path, kind: Kind, remedy: str = "give another folder") -> 
 
 
 def is_own(folder: Path, kind: Kind) -> bool:
-    """Returns whether a folder is ours: by its marker, or without one by its content."""
+    """Checks whether a folder is ours: by its marker, or without one by its content."""
     found = kind_of(folder)
     if found is not None:
         return found == kind
@@ -177,7 +177,7 @@ def is_own(folder: Path, kind: Kind) -> bool:
 
 
 def holds(path: Path, *marks: bytes) -> bool:
-    """Returns whether a path is a regular file, and no link, in which all of these bytes stand."""
+    """Checks whether a path is a regular file, not a link, that contains all of these bytes."""
     try:
         found = os.lstat(path)
         if not stat.S_ISREG(found.st_mode) or found.st_size > _LARGEST:
@@ -250,7 +250,7 @@ def make_folder(folder: Path) -> None:
 def _workshop(path: Path) -> Path:
     """Returns where a file is written before it gets its name.
 
-    Beside the marker of the folder it is in.
+    That is beside the marker of the folder it is in.
     """
     marked = _marked(path.absolute().parent)
     return marked[0] / MARKER if marked else path.parent

@@ -80,7 +80,7 @@ class LatticeStage:
     """Directions of the Fibonacci lattice at every place."""
 
     def columns(self, grid_shape: Sequence[int], cell_size: float) -> np.ndarray:
-        """Returns the cells (x, y) that hold a point of the lattice, [n, 2]; no cell twice.
+        """Finds the cells (x, y) that hold a point of the lattice, [n, 2], each once.
 
         The lattice lies half a spacing inside the box's lower corner.
         """
@@ -129,9 +129,9 @@ STAGES = (LatticeStage(1.0, (1.75,), 5), LatticeStage(0.5, (1.0, 2.5), 15))
 
 
 def floor_layer(free: np.ndarray) -> int:
-    """Returns the lowest layer of free cells [X, Y, Z], their lowest 2 % left out.
+    """Finds the lowest layer of free cells [X, Y, Z], ignoring the lowest 2 % of them.
 
-    0 if there is none.
+    The layer is 0 if no cell is free.
     """
     layers = np.nonzero(free)[2]
     return int(np.quantile(layers, _BELOW_FLOOR, method="higher")) if len(layers) else 0
@@ -195,7 +195,7 @@ def empty_pools(grid_shape: Sequence[int], cell_size: float) -> Pools:
 
 
 def admit(pool: Pool, has_place: np.ndarray) -> Pool:
-    """Returns all directions of the places [P] that can be stood at join the pool."""
+    """Adds all directions of the places [P] where a camera can stand to the pool."""
     return replace(pool, entered=np.asarray(pool.entered) | has_place[:, None])
 
 
@@ -255,14 +255,14 @@ def _best_remembered(
 
 
 def empty_share(view: PixelView) -> Float[Array, ""]:
-    """Returns the gain: share of the pixels in which the map shows nothing."""
+    """Computes the gain: the share of pixels in which the map shows nothing."""
     return jnp.mean(~view.hit, dtype=jnp.float32)
 
 
 def score_of(gain: np.ndarray, distance: np.ndarray) -> np.ndarray:
-    """Returns (1 - softmax(d)) g / sum(g) of gains and distances [m], [C] each.
+    """Computes (1 - softmax(d)) g / sum(g) of gains and distances [m], [C] each.
 
-    0 if all gains are 0.
+    All scores are 0 if all gains are 0.
     """
     # Shifted by the largest: exp of a hundred meters would overflow.
     far = np.exp(distance - distance.max())
@@ -277,14 +277,14 @@ class ActiveGamer(GreedyPolicy):
     source = "ActiveGAMER, Chen et al., CVPR 2025"
 
     def first_memory(self, camera: Camera, grid: OccupancyGrid) -> Pools:
-        """Returns the empty pools."""
+        """Returns empty pools."""
         del camera
         return empty_pools(grid.log_odds.shape, float(grid.cell_size))
 
     def draw(self, situation: Situation, *, key: Array) -> Drawn:
-        """Returns the pool's candidates, noted where they stand in it.
+        """Draws candidates from the pools, and notes their places there.
 
-        Any nearby view if there is none.
+        If the pools have none, any nearby views are drawn.
         """
         num = self.config.num_candidates
         pools, found = draw_candidates(situation.memory, situation.travel, num, situation.limits)
@@ -295,7 +295,7 @@ class ActiveGamer(GreedyPolicy):
     def score(
         self, situation: Situation, candidates: Candidates, *, key: Array
     ) -> tuple[Candidates, dict[str, np.ndarray]]:
-        """Returns the gain and distance of the pool's candidates; lots for others."""
+        """Computes the gain and distance of the pool's candidates; others draw random scores."""
         if situation.notes is None:
             return candidates, draw_lots(len(candidates.valid), key=key)
         gain = self._gain(situation.camera, situation.map_state, situation.grid, candidates)
@@ -307,7 +307,7 @@ class ActiveGamer(GreedyPolicy):
     def score_again(
         self, situation: Situation, candidates: Candidates, *, before: np.ndarray, key: Array
     ) -> Scored:
-        """Returns the their order stays: where they stand in the pool is not known any more."""
+        """Keeps the order of the candidates: their places in the pool are no longer known."""
         del situation, key
         return candidates, {"lot": before}
 
@@ -338,7 +338,7 @@ class ActiveGamer(GreedyPolicy):
     def scoring_for(self, grid: OccupancyGrid) -> ScoringConfig:
         """Returns the settings of the score.
 
-        What the map holds counts at any distance within the box.
+        Voxels of the map count at any distance within the box.
         """
         # The diagonal of the box: nothing within it is out of range.
         extent = np.linalg.norm(grid.log_odds.shape) * float(grid.cell_size)
@@ -347,7 +347,7 @@ class ActiveGamer(GreedyPolicy):
     def _gain(
         self, camera: Camera, map_state: MapState, grid: OccupancyGrid, candidates: Candidates
     ) -> np.ndarray:
-        """Returns the share of empty pixels of each view [C]; 0 for padding."""
+        """Computes the share of empty pixels of each view [C]; 0 for padding."""
         poses, scoring = candidates.poses_on_device(), self.scoring_for(grid)
         gain = score_pixels(empty_share, map_state, grid, camera, poses, scoring)
         return np.where(candidates.valid, np.asarray(gain, dtype=np.float64), 0.0)

@@ -100,7 +100,7 @@ def low_confidence(
 def regions_of(
     free: np.ndarray, unexplored: np.ndarray, count: np.ndarray, normal_sum: np.ndarray
 ) -> Regions:
-    """Returns the frontier and the cells of low confidence, those with a free face neighbor.
+    """Finds the frontier, and the cells of low confidence that have a free face neighbor.
 
     A frontier cell is unexplored and is looked at from the mean direction to its free face
     neighbors, any other from the mean normal of its voxels of low confidence.
@@ -170,7 +170,7 @@ def aimed_views(
 def _draw(
     travel: Travel, cells: np.ndarray, normals: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the random places round cells, [R, _DRAWS, 3] [m], and which of them could do."""
+    """Draws random places round cells, [R, _DRAWS, 3] [m], and checks which are suitable."""
     closest, farthest = VIEW_DISTANCE
     aims = travel.centers(cells)[:, None, :]
     directions = _draw_directions(normals, rng)
@@ -195,9 +195,9 @@ def _draw(
 
 
 def _draw_directions(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Returns the random unit vectors within 60 degrees of normals [R, 3], or anywhere.
+    """Draws random unit vectors within 60 degrees of normals [R, 3], [R, _DRAWS, 3].
 
-    [R, _DRAWS, 3].
+    Where the normal is zero, they are uniform on the sphere.
     """
 
     def unit(x: np.ndarray) -> np.ndarray:
@@ -286,12 +286,12 @@ class ActiveGS(GreedyPolicy):
     source = "Active-GS, Jin et al., RA-L 2025"
 
     def first_memory(self, camera: Camera, grid: OccupancyGrid) -> Any:
-        """Begins with no voxel seen."""
+        """Returns the memory before the first frame: no voxel has been seen."""
         del camera, grid
         return no_sightings()
 
     def observe(self, state: PlannerState, map_state: MapState, frame: Frame) -> PlannerState:
-        """Returns directions, distances and normals of the frame's voxels."""
+        """Adds the directions, distances and normals of the frame's voxels to the memory."""
         reach = self.config.scoring.max_range
         # The table may have grown with this frame, which moves its rows.
         before = aligned(state.memory, map_state)
@@ -310,7 +310,7 @@ class ActiveGS(GreedyPolicy):
     def score(
         self, situation: Situation, candidates: Candidates, *, key: Array
     ) -> tuple[Candidates, dict[str, np.ndarray]]:
-        """Returns U of every view, its two parts, and lots in case that every U is zero."""
+        """Computes U of every view and its two parts; random scores decide if every U is 0."""
         scoring, confidence = self.config.scoring, situation.memory.confidence
         reach = _REACH * float(scoring.max_range)
         cells, rendering = score_by_pixels(

@@ -43,13 +43,13 @@ EMPTY_DEPTH = 1e-3
 
 
 def normals_of(scene: GaussianScene) -> Float[Array, "n 3"]:
-    """Returns the unit normals of discs: their third axes."""
+    """Returns the unit normals of the discs: their third axes."""
     rotation = rotation_rows(scene.quats)
     return jnp.stack([rotation[i][2] for i in range(3)], axis=1)
 
 
 def confidence(marks: Float[Array, "n 5"]) -> Float[Array, " n"]:
-    """Returns the c of every Gaussian, from its supports, sum of view directions and score."""
+    """Computes C of every Gaussian from its supports, sum of view directions and score."""
     spread = safe_norm(marks[:, 1:4], axis=1) / jnp.maximum(marks[:, 0], 1.0)
     return jnp.clip(jnp.exp(1.0 - spread) * marks[:, 4], 0.0, 1.0)
 
@@ -73,7 +73,7 @@ def support(
 
 
 def rendering_utility(seen: Seen, max_range: Float[Array, ""]) -> Float[Array, ""]:
-    """Returns the mean over pixels of (1 - C) depth / d_max; `seen.rgb` is C."""
+    """Computes the mean over pixels of (1 - C) depth / d_max; `seen.rgb` is C."""
     depth, believed = seen.depth, seen.rgb[..., 0]
     is_empty = depth < EMPTY_DEPTH
     doubt = jnp.where(is_empty, 1.0, jnp.where(depth > max_range, 0.0, 1.0 - believed))
@@ -105,7 +105,7 @@ def _scores(
     poses: Float[Array, "C 4 4"],
     max_range: Float[Array, ""],
 ) -> tuple[tuple[Array, Array], Array]:
-    """Returns the visible cells and the rendering utility of every pose."""
+    """Counts the visible cells and computes the rendering utility of every pose."""
     offsets = jnp.zeros((believed.capacity, 2))
 
     def score(pose: Array) -> tuple[tuple[Array, Array], Array]:
@@ -161,7 +161,7 @@ class ActiveGSOnline(OnlinePolicy):
     def score(
         self, situation: Situation, candidates: Candidates, *, key: Array
     ) -> tuple[Candidates, dict[str, np.ndarray]]:
-        """Returns U of every view, its two parts, and lots in case that every U is zero."""
+        """Computes U of every view and its two parts; random scores decide if every U is 0."""
         online = memory_of(situation)
         believed = colored(online.scene, confidence(online.marks))
         cells, rendering = with_room(

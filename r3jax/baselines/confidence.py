@@ -61,7 +61,7 @@ class Sightings(eqx.Module):
 
 
 def no_sightings(capacity: int = 2) -> Sightings:
-    """Returns the nothing seen yet."""
+    """Returns sightings of no voxel."""
     return Sightings(
         key=jnp.full((2, capacity), EMPTY_WORD, dtype=jnp.uint32),
         views=jnp.zeros(capacity),
@@ -72,9 +72,9 @@ def no_sightings(capacity: int = 2) -> Sightings:
 
 
 def aligned(seen: Sightings, state: MapState) -> Sightings:
-    """Returns the same sightings, row by row those of the map's voxels. Outside jit.
+    """Reorders the sightings so that their rows are those of the map.
 
-    Shapes may change.
+    Not to be called under jit: shapes may change.
 
     A map never moves its rows but to grow. Voxels that the map does not have are forgotten.
     """
@@ -150,7 +150,7 @@ def _sight(
     frame: Frame,
     max_range: Float[Array, ""],
 ) -> Sightings:
-    """Returns one frame's sighting of the voxels that some points stand for."""
+    """Computes one frame's sighting of the voxels that hold some points."""
     num = groups.is_leader.shape[0]
     # Padding lies past the end: clipped to be read here, and then found in no row.
     index = jnp.minimum(leader, num - 1)
@@ -188,7 +188,7 @@ def _unit(x: Float[Array, "3 M"]) -> Float[Array, "3 M"]:
 
 
 def _weight(distance: Float[Array, " N"], max_range: Float[Array, ""]) -> Float[Array, " N"]:
-    """Returns what a sighting counts by its distance: all at the camera, nothing at the range."""
+    """Weighs a sighting by its distance: 1 at the camera, 0 at the range."""
     # Rays within range by depth may be longer than it off the axis: no negative weights.
     return jnp.maximum(0.0, 1.0 - distance / max_range)
 

@@ -40,7 +40,7 @@ class SeenBins(eqx.Module):
 def coverage_of_pixels(
     seen: SeenBins, offset: Float[Array, "3 h w"], hit: Float[Array, "h w"]
 ) -> Float[Array, ""]:
-    """Returns the mean of c over the covered pixels, in [0, 1]; 1 where no pixel is covered.
+    """Computes the mean of c over the covered pixels, in [0, 1]; 1 if no pixel is covered.
 
     A view that shows nothing of the map has no direction that could be new: it must not win over
     views that have, so it counts as covered, and only its unexplored cells speak for it.
@@ -59,7 +59,7 @@ def coverage_of_pixels(
 
 
 def _novelty_and_cells(view: PixelView) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Returns 1 - mean c, and the visible unexplored cells."""
+    """Computes 1 - mean c, and counts the visible unexplored cells."""
     hit = view.hit.astype(jnp.float32)
     return 1.0 - coverage_of_pixels(view.rows, view.offset, hit), view.cells
 

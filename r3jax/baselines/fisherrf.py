@@ -100,7 +100,7 @@ def _added(
     total: GaussianScene,
     form: Form,
 ) -> tuple[GaussianScene, Array]:
-    """Returns the sum of H with one more view in it."""
+    """Adds one more view to the sum of H."""
     found, overflow = information(config, scene, camera, pose, form)
     return jax.tree.map(jnp.add, total, found), overflow
 
@@ -114,7 +114,7 @@ def _scores(
     known: GaussianScene,
     form: Form,
 ) -> tuple[Array, Array]:
-    """Returns the score of every pose."""
+    """Computes the score of every pose."""
 
     def score(pose: Array) -> tuple[Array, Array]:
         found, overflow = information(config, scene, camera, pose, form)
@@ -124,7 +124,7 @@ def _scores(
 
 
 def gain(found: GaussianScene, known: GaussianScene, form: Form) -> Float[Array, ""]:
-    """Returns what a view of information `found` adds to what is `known`."""
+    """Computes how much a view of information `found` adds to the `known` information."""
 
     def part(new: Array, old: Array) -> Array:
         share = new / (old + form.damping)
@@ -136,7 +136,7 @@ def gain(found: GaussianScene, known: GaussianScene, form: Form) -> Float[Array,
 def known_information(
     scene: GaussianScene, camera: Camera, poses: np.ndarray, form: Form
 ) -> GaussianScene:
-    """Returns sums H over the views that the model was trained on. Not to be called under jit.
+    """Sums H over the views that the model was trained on. Not to be called under jit.
 
     Args:
         scene: the model as it is.
@@ -246,7 +246,7 @@ class FisherRF(OnlinePolicy):
     def score(
         self, situation: Situation, candidates: Candidates, *, key: Array
     ) -> tuple[Candidates, dict[str, np.ndarray]]:
-        """Returns the information that each view adds to that of all frames so far."""
+        """Computes the information that each view adds to that of all frames so far."""
         online, form = memory_of(situation), self.config.form
         camera = self.score_camera(situation.camera)
         # Recomputed for each decision: the model has changed since, and its information with it.

@@ -61,7 +61,7 @@ SAME_PLACE, SAME_DIRECTION = 0.3, np.deg2rad(10.0)
 
 
 def side_weights(scene: GaussianScene, position: Float[Array, " 3"]) -> Float[Array, "n 4"]:
-    """Returns w_k of a view from `position`: how much of it goes along +x, +y, -x, -y."""
+    """Computes w_k of a view from `position`: how much of it goes along +x, +y, -x, -y."""
     offset = scene.means - position[None, :]
     unit = offset / jnp.maximum(safe_norm(offset, axis=1), 1e-6)[:, None]
     x, y = unit[:, 0], unit[:, 1]
@@ -70,7 +70,7 @@ def side_weights(scene: GaussianScene, position: Float[Array, " 3"]) -> Float[Ar
 
 
 def reliability(marks: Float[Array, "n 4"]) -> Float[Array, "n 4"]:
-    """Returns r_k from log-odds."""
+    """Computes r_k from log-odds."""
     return jnp.clip(jax.nn.sigmoid(marks), *RELIABILITY)
 
 
@@ -78,9 +78,9 @@ def reliability(marks: Float[Array, "n 4"]) -> Float[Array, "n 4"]:
 def evidence(
     seen: Seen, rgb: Float[Array, "h w 3"], depth: Float[Array, "h w"]
 ) -> Float[Array, "h w"]:
-    """Returns -ln l of every pixel.
+    """Computes -ln l of every pixel.
 
-    L = 1.7 (0.95 color error + 0.05 depth error), at least 1e-4.
+    Here l = 1.7 (0.95 color error + 0.05 depth error), at least 1e-4.
     """
     # By the photo, whatever the map shows there: where it shows nothing it is wrong.
     has_color, has_depth = rgb.sum(axis=-1) > 0.01, depth > 0.01
@@ -116,7 +116,7 @@ def _scores(
     marks: Float[Array, "n 4"],
     poses: Float[Array, "C 4 4"],
 ) -> tuple[Array, Array]:
-    """Returns the sum over pixels of weight x sum over k of w_k (-ln r_k), of every pose."""
+    """Computes the sum over pixels of weight x sum over k of w_k (-ln r_k), for every pose."""
     doubt, offsets = -jnp.log(reliability(marks)), jnp.zeros((scene.capacity, 2))
 
     def score(pose: Array) -> tuple[Array, Array]:
@@ -129,12 +129,14 @@ def _scores(
 
 
 def novelty(pose: np.ndarray, before: np.ndarray) -> float:
-    """Returns 1 - 0.95^k, k poses back to the first that is like this one, from the second-last on.
+    """Computes 1 - 0.95^k, where k counts the poses back to the latest similar one.
+
+    The search starts at the second-last pose.
 
     Args:
         pose: of the view on offer, [4, 4].
         before: poses of all frames so far, [F, 4, 4]; with five or fewer no view is held back. As
-            published, the first of all is not asked.
+            published, the very first pose is not compared.
     """
     if len(before) <= 5:
         return 1.0
@@ -181,7 +183,7 @@ class GaussMI(OnlinePolicy):
     def score(
         self, situation: Situation, candidates: Candidates, *, key: Array
     ) -> tuple[Candidates, dict[str, np.ndarray]]:
-        """Returns the utility of every view, as for images of the published size."""
+        """Computes the utility of every view, scaled to images of the published size."""
         online, camera = memory_of(situation), self.score_camera(situation.camera)
         poses = candidates.poses_on_device()
         sums = with_room(_scores, online.scene, camera, online.marks, poses)

@@ -69,7 +69,9 @@ def unseen_share(
     num_bins: int,
     kappa: Float[Array, ""],
 ) -> Float[Array, "..."]:
-    """Returns 1 - V: the product over the visited bins of 1 - exp(kappa (<q_k, d> - 1)), in [0, 1].
+    """Computes 1 - V: the product over the visited bins of 1 - exp(kappa (<q_k, d> - 1)).
+
+    It lies in [0, 1].
 
     1 where no bin was visited, 0 at the direction of one that was.
 
@@ -142,7 +144,7 @@ def entropy_of_views(
     num_bins: int,
     num_steps: int,
 ) -> Float[Array, " C"]:
-    """Returns the mean over the rays of each view of H(u), [nats].
+    """Computes the mean over the rays of each view of H(u) [nats].
 
     Args:
         ends: of the rays of all views.
@@ -173,7 +175,7 @@ def unknown_share(
     cells: Float[Array, "h w"],
     beliefs: Beliefs,
 ) -> Float[Array, "h w"]:
-    """Returns u: the probability that a ray's color comes from something that no photo shows."""
+    """Computes u: the probability that a ray's color comes from something in no photo."""
     passes = (1.0 - beliefs.cell_opacity) ** cells
     # As a sum of what is small: 1 - passes (1 - unseen) would lose the digits of a known voxel.
     return (1.0 - passes) + passes * jnp.where(hit, unseen, 0.0)
@@ -195,9 +197,9 @@ def unexplored_before(
     max_range: Float[Array, ""],
     num_steps: int,
 ) -> Float[Array, "h w"]:
-    """Returns lengths of rays in unexplored cells, in edges of a cell.
+    """Measures how far rays run through unexplored cells, in edges of a cell.
 
-    One sample per edge (midpoint rule).
+    There is one sample per edge (midpoint rule).
 
     Args:
         depth: z-depth at which the rays end [m].
@@ -251,7 +253,7 @@ class GavisConfig(PlannerConfig):
             raise InputError(f"cell_opacity must lie in [0, 1], got {self.cell_opacity}")
 
     def beliefs(self) -> Beliefs:
-        """Returns the three of them, traced, so that a sweep compiles once."""
+        """Returns the three parameters as arrays, traced, so that a sweep compiles once."""
         numbers = (self.kappa, self.cell_opacity, self.color_entropy)
         return Beliefs(*(jnp.asarray(number, dtype=jnp.float32) for number in numbers))
 
@@ -269,7 +271,7 @@ class Gavis(GreedyPolicy):
     def score(
         self, situation: Situation, candidates: Candidates, *, key: Array
     ) -> tuple[Candidates, dict[str, np.ndarray]]:
-        """Returns the mean entropy of the rays of every view."""
+        """Computes the mean entropy of the rays of every view."""
         del key
         state, grid, scoring = situation.map_state, situation.scoring_grid, self.config.scoring
         poses = candidates.poses_on_device()

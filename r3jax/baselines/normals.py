@@ -70,7 +70,7 @@ def _slope(
 
 
 def _shifted(image: Float[Array, "H W"], by: int, axis: int) -> Float[Array, "H W"]:
-    """Returns the pixel `by` places further along an axis; 0 beyond the border."""
+    """Shifts an image by `by` pixels along an axis; 0 beyond the border."""
     size = image.shape[axis]
     if abs(by) >= size:
         return jnp.zeros_like(image)

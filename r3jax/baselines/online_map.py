@@ -195,7 +195,7 @@ def is_wrong(
     seen: tuple[np.ndarray, np.ndarray, np.ndarray],
     settings: MapSettings,
 ) -> np.ndarray:
-    """Returns pixels of the wrong color, too little opacity, or a surface in front of the map's."""
+    """Finds pixels of the wrong color, of too little opacity, or before the map's surface."""
     color, distance, alpha = seen
     error = np.mean((color - rgb) ** 2, axis=-1)
     return (
@@ -501,13 +501,13 @@ def _gradient_of_view(
 
 @partial(jax.jit, donate_argnums=0)
 def _added(total: GaussianScene, part: GaussianScene, rows: Int[Array, " r"]) -> GaussianScene:
-    """Returns the total with a part added to its rows; those beyond its capacity go nowhere."""
+    """Adds a part to the rows of the total; rows beyond its capacity are dropped."""
     add = lambda t, p: t.at[rows].add(p, mode="drop", unique_indices=True)
     return jax.tree.map(add, total, part)
 
 
 def _unevenness(scene: GaussianScene) -> Float[Array, ""]:
-    """Returns the mean difference between a Gaussian's sizes and their mean [m]."""
+    """Computes the mean difference between a Gaussian's sizes and their mean [m]."""
     sizes = jnp.exp(scene.log_scales)
     uneven = jnp.mean(jnp.abs(sizes - sizes.mean(axis=1, keepdims=True)), axis=1)
     return _mean_over(uneven, scene.is_alive.astype(jnp.float32))
@@ -577,7 +577,7 @@ def _stepped(
     num: Array,
     settings: MapSettings,
 ) -> tuple[GaussianScene, Moments]:
-    """Returns one step of Adam down the mean gradient of a batch of `num` key frames."""
+    """Takes one step of Adam down the mean gradient of a batch of `num` key frames."""
     gradient = jax.tree.map(lambda g: g / num, total)
     if settings.isotropy > 0.0:
         uneven = jax.grad(_unevenness)(scene)
@@ -633,9 +633,9 @@ def _pruned(online: OnlineMap, settings: MapSettings) -> OnlineMap:
 
 
 def colored(scene: GaussianScene, values: Float[Array, " n"]) -> GaussianScene:
-    """Returns the scene with a gray of any value >= 0 per Gaussian.
+    """Gives each Gaussian of the scene a gray of any value >= 0.
 
-    Rendering composites the values.
+    Rendering then composites the values.
     """
     sh = jnp.broadcast_to(((values - 0.5) / SH0)[:, None, None], scene.sh.shape)
     return eqx.tree_at(lambda s: s.sh, scene, sh)

@@ -66,9 +66,9 @@ def score_by_pixels(
     rows: Any = (),
     reach: float | None = None,
 ) -> list[np.ndarray]:
-    """Returns `score_pixels` of a situation.
+    """Scores the candidates of a situation by `score_pixels`.
 
-    Each number that `value` gives of a view, [C] float64.
+    Returns an array [C] float64 for each number that `value` computes of a view.
     """
     numbers = score_pixels(
         value,
@@ -93,7 +93,7 @@ def score_pixels(
     rows: Any = (),
     reach: float | None = None,
 ) -> Any:
-    """Returns `value` of every pose; fields of shape [C, ...]. Not to be called under jit.
+    """Computes `value` of every pose; fields of shape [C, ...]. Not to be called under jit.
 
     Args:
         value: what to make of a view.

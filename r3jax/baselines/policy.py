@@ -82,7 +82,7 @@ class OnlinePolicy(GreedyPolicy):
     def score_camera(self, camera: Camera) -> Camera:
         """Returns the camera that candidates are scored with.
 
-        The same field of view, fewer pixels.
+        It has the same field of view and fewer pixels.
         """
         return camera.resized(*fitted_size(camera.width, camera.height, self.config.score_width))
 

@@ -84,7 +84,7 @@ class R3con(GreedyPolicy):
     Config = R3conConfig
 
     def draw(self, situation: Situation, *, key: Array) -> Drawn:
-        """Returns centers of different safe cells within the radius."""
+        """Draws centers of different safe cells within the radius."""
         travel, num = situation.travel, self.config.num_candidates
         cells = np.argwhere(travel.goals)
         is_other = np.any(cells != np.array(travel.start_cell), axis=1)
@@ -124,7 +124,7 @@ class R3con(GreedyPolicy):
         }
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
-        """Returns the shares of utility and path; what cannot be reached does not weigh paths."""
+        """Combines utility and path; unreachable candidates do not affect the weight of paths."""
         path = utilities["path"]  # inf for padding, too
         counts = np.isfinite(path)
         weight = utilities["mean_lack"][counts].max() if counts.any() else 0.0
@@ -142,9 +142,10 @@ def _look_round(
     cell_weight: Float[Array, ""],
     places: tuple[Float[Array, "C 3"], Bool[Array, "C B"]],
 ) -> tuple[Float[Array, "C 3"], *tuple[Float[Array, " C"], ...]]:
-    """Returns the of each position.
+    """Finds the best axis of each position, and sums what is visible from there.
 
-    Best axis, its cone's sum, visible cells, sum of (1 - R), visible voxels.
+    Returns the axis, the sum in its cone, the visible cells, the sum of (1 - R), and the visible
+    voxels.
 
     Cells are the unexplored ones, and all but the second are of all directions.
     """

@@ -98,7 +98,7 @@ class Capture:
         return len(self.source.rows if isinstance(self.source, Run) else self.source)
 
     def frames(self) -> Iterator[Frame]:
-        """Returns every frame in order, read one by one."""
+        """Yields every frame in order, read one by one."""
         return self.source.frames()
 
     @property
@@ -140,7 +140,7 @@ def open_capture(path: Path, up: Literal["y", "z"] = "y", topics: Topics | None 
 
 
 def _below(path: Path) -> str | None:
-    """Returns says which folder in it is a capture, where the folder itself is none."""
+    """Names the subfolder that is a capture, where the folder itself is none."""
     if not path.is_dir():
         return None
     folders = sorted(entry for entry in path.iterdir() if entry.is_dir())[:_MOST_BELOW]

@@ -52,9 +52,9 @@ class DepthUnit:
     """Units of the capture per 1.0 where the numbers are floats."""
 
     def depth(self, steps: np.ndarray) -> np.ndarray:
-        """Returns z-depth [h, w] float32 of stored numbers.
+        """Converts stored numbers to z-depth [h, w] float32.
 
-        0 no measurement, inf beyond the range.
+        0 means no measurement, inf beyond the range.
         """
         if steps.dtype.kind == "f":
             return (steps * self.metres_per_unit).astype(np.float32)
@@ -116,7 +116,7 @@ def _load_openexr() -> Any:
 
 
 def _pixels_of_exr(data: bytes) -> np.ndarray:
-    """Returns the only channel of an EXR image, or the one that is named like depth."""
+    """Reads the only channel of an EXR image, or the one that is named like depth."""
     openexr = _load_openexr()
     try:
         file = openexr.InputFile(io.BytesIO(data))
@@ -176,9 +176,9 @@ def resample_depth(depth: np.ndarray, lens: Lens, depth_lens: Lens | None = None
 def _along(
     count: int, focal: float, center: float, focal_depth: float, center_depth: float
 ) -> np.ndarray:
-    """Returns pixels of the depth image along one axis, [count] int64; -1 and beyond.
+    """Finds pixels of the depth image along one axis, [count] int64.
 
-    Outside of it.
+    An index of -1, or beyond the last pixel, lies outside the image.
     """
     slope = (np.arange(count) + 0.5 - center) / focal
     return np.floor(focal_depth * slope + center_depth).clip(-1, 1 << 30).astype(np.int64)

@@ -123,7 +123,7 @@ def _write_transforms(out: Path, run: Run, points: str | None) -> None:
 def posed_model(
     lens: Lens, names: Sequence[str], poses: np.ndarray, points: ColmapPoints
 ) -> ColmapModel:
-    """Returns a model of images from one camera, without keypoints; everything is numbered from 1.
+    """Makes a model of images from one camera, without keypoints, numbered from 1.
 
     Args:
         lens: the camera of all images.
@@ -142,9 +142,9 @@ def posed_model(
 
 
 def model_of(run: Run, xyz: np.ndarray, rgb: np.ndarray) -> ColmapModel:
-    """Returns the model of a run.
+    """Makes the model of a run.
 
-    Its views, its one camera, and points that no view is known to see.
+    It has the run's views and its one camera; its points have no tracks.
 
     Args:
         run: a run.

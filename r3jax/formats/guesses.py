@@ -45,7 +45,7 @@ def nearest_guess(path: Path) -> str | None:
 
 
 def _names(path: Path) -> list[str]:
-    """Returns names in a folder and in the folders below it, with a slash between."""
+    """Lists names in a folder and in the folders below it, joined by a slash."""
     found: list[str] = []
     for entry in sorted(os.listdir(path))[:_MOST]:
         found.append(entry)
@@ -55,7 +55,7 @@ def _names(path: Path) -> list[str]:
 
 
 def _of_archive(path: Path) -> str | None:
-    """Returns a zip archive or database that is damaged, or of something else."""
+    """Describes a zip archive or database that is damaged or has another content."""
     if path.suffix.lower() == ".db":
         return _of_database(path)
     if path.suffix.lower() not in SUFFIXES:

@@ -129,15 +129,15 @@ class Lens:
         return self.model in _PINHOLE_WITHOUT_DISTORTION and not any(self.distortion.values())
 
     def has_shape(self, width: int, height: int) -> bool:
-        """Returns True if images of this size may be its own, scaled.
+        """Checks whether images of this size are this lens's, scaled.
 
-        Each side rounded to a pixel.
+        Each side may be rounded to a pixel.
         """
         off = abs(width * self.height - height * self.width)
         return min(width, height) > 0 and off <= self.width + self.height
 
     def resized(self, width: int, height: int) -> "Lens":
-        """Returns the lens of the same images with another number of pixels [px]."""
+        """Scales the lens to images of another number of pixels [px]."""
         across, down = width / self.width, height / self.height
         scales = (across, across, down) if MODELS[self.model][1][0] == "f" else (
             across, down, across, down,
@@ -152,7 +152,7 @@ class Lens:
 
 
 def matrix_lens(K: np.ndarray, size: tuple[int, int], offset: float = 0.5) -> Lens:
-    """Returns the PINHOLE of a matrix of intrinsics, [3, 3] or larger.
+    """Makes the PINHOLE of a matrix of intrinsics, [3, 3] or larger.
 
     Args:
         K: the matrix.
@@ -164,6 +164,6 @@ def matrix_lens(K: np.ndarray, size: tuple[int, int], offset: float = 0.5) -> Le
 
 
 def pinhole_lens(camera: Camera) -> Lens:
-    """Returns the PINHOLE of a camera."""
+    """Makes the PINHOLE of a camera."""
     values = (camera.fx, camera.fy, camera.cx, camera.cy)
     return Lens("PINHOLE", camera.width, camera.height, tuple(float(value) for value in values))

@@ -146,7 +146,7 @@ def read_transforms(path: Path | str) -> PosedImages:
 
 
 def _smaller_copies(folder: Path, images: list[Path]) -> list[Path]:
-    """Returns where all images are gone, their copies in images_2, images_4 or images_8, if any."""
+    """Finds the copies in images_2, images_4 or images_8 if all images are missing."""
     if folder in {image.parent for image in images} or any(map(os.path.exists, images)):
         return images
     for copy in COPIES:
@@ -157,10 +157,7 @@ def _smaller_copies(folder: Path, images: list[Path]) -> list[Path]:
 
 
 def find_transforms(path: Path) -> Path | None:
-    """Returns the file in a folder.
-
-    Transforms.json, else the training views of a split data set.
-    """
+    """Finds transforms.json in a folder, else the training views of a split data set."""
     found = (path / name for name in NAMES if path.is_dir())
     return next((file for file in found if file.exists()), None)
 
@@ -182,9 +179,9 @@ def _depth(folder: Path, index: int, frame: _Fields) -> Path | None:
 
 
 def _depth_unit(content: _Fields) -> DepthUnit:
-    """Returns the unit by nerfstudio's key or instant-ngp's.
+    """Reads the unit from nerfstudio's key or instant-ngp's.
 
-    Without one millimeters, and meters of floats.
+    Without a key, whole numbers are millimeters and floats are meters.
 
     nerfstudio itself takes floats without a key for millimeters, but users store meters.
     """
@@ -206,7 +203,7 @@ def _depth_unit(content: _Fields) -> DepthUnit:
 
 
 def _applied(content: _Fields) -> np.ndarray | None:
-    """Returns `applied_transform` and `applied_scale` as one 4x4 matrix."""
+    """Combines `applied_transform` and `applied_scale` in one 4x4 matrix."""
     rows = content.get("applied_transform")
     if rows is None and content.get("applied_scale") is None:
         return None
@@ -216,7 +213,7 @@ def _applied(content: _Fields) -> np.ndarray | None:
 
 
 def _applied_scale(content: _Fields) -> float:
-    """Returns what all positions were multiplied by; 1 where the file does not say."""
+    """Reads the factor of all positions; 1 if the file contains none."""
     scale = content.get("applied_scale")
     check_type("applied_scale", scale, float | None)
     if scale is None:
@@ -227,7 +224,7 @@ def _applied_scale(content: _Fields) -> float:
 
 
 def _matrix(name: str, rows: Any, size: int = 4) -> np.ndarray:
-    """Returns a square matrix; its last row may be left out."""
+    """Reads a square matrix, whose last row may be left out."""
     check_type(name, rows, list[list[float]])
     if [len(row) for row in rows] not in ([size] * (size - 1), [size] * size):
         raise ForeignFileError(f"`{name}` must be a {size - 1}x{size} or a {size}x{size} matrix")
@@ -237,7 +234,7 @@ def _matrix(name: str, rows: Any, size: int = 4) -> np.ndarray:
 
 
 def _pose(path: Path, which: str, frame: _Fields) -> np.ndarray:
-    """Returns `T_world_camera` in OpenCV axes."""
+    """Reads `T_world_camera` in OpenCV axes."""
     name = f"{which}.transform_matrix"
     with naming(path):
         check_fields(which, frame, {"transform_matrix": list[Any]})
@@ -246,7 +243,7 @@ def _pose(path: Path, which: str, frame: _Fields) -> np.ndarray:
 
 
 def _lens(path: Path, which: str, fields: _Fields, images: Sequence[Path]) -> Lens:
-    """Returns the camera of one frame; of the images the frame's own goes first."""
+    """Reads the camera of one frame; `images` begin with the frame's own."""
     with naming(path):
         try:
             width, height = _size(fields, images)
@@ -267,7 +264,7 @@ def _size(fields: _Fields, images: Sequence[Path]) -> tuple[int, int]:
 
 
 def _whole(fields: _Fields, name: str) -> int:
-    """Returns a size; instant-ngp writes it with a decimal point."""
+    """Reads a size, which instant-ngp writes with a decimal point."""
     value = _value(fields, name)
     if value != int(value):
         raise ForeignFileError(f"`{name}` must be a whole number, got {value:g}")
@@ -305,9 +302,9 @@ def _lens_of(fields: _Fields, width: int, height: int) -> Lens:
 
 
 def _focal_lengths(fields: _Fields, width: int, height: int) -> tuple[float, float]:
-    """Returns the from `fl_x` and `fl_y`, else from the angles of view.
+    """Reads `fl_x` and `fl_y`, else computes both from the angles of view.
 
-    One of them serves both axes.
+    If only one axis is given, it serves both.
     """
     sides = {"x": width, "y": height}
     found: list[float] = []
@@ -325,7 +322,7 @@ def _focal_lengths(fields: _Fields, width: int, height: int) -> tuple[float, flo
 
 
 def transforms_of(run: Run, points: str | None = None) -> dict[str, Any]:
-    """Returns the content of transforms.json.
+    """Builds the content of transforms.json.
 
     Args:
         run: a run with at least one view.
@@ -413,7 +410,7 @@ class Normalization(NamedTuple):
     """Applied after it."""
 
     def undone(self, poses: np.ndarray, T_capture_original: np.ndarray | None) -> np.ndarray:
-        """Returns poses in a capture's own coordinates, [n, 4, 4].
+        """Transforms poses back to a capture's own coordinates, [n, 4, 4].
 
         Args:
             poses: camera to the training's coordinates, [n, 4, 4].

@@ -66,9 +66,9 @@ class _Vertices:
 
 
 def read_points(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
-    """Returns positions [n, 3] float64 and colors [n, 3] uint8 of the vertices.
+    """Reads positions [n, 3] float64 and colors [n, 3] uint8 of the vertices.
 
-    Gray where there are none.
+    Vertices without a color are gray.
 
     The file may be binary of either byte order or text. Other properties are skipped, and other
     elements behind the vertices too.
@@ -161,7 +161,7 @@ def _text_table(data: bytes, vertices: _Vertices) -> np.ndarray:
 
 
 def _colors(table: np.ndarray) -> np.ndarray:
-    """Returns [n, 3] uint8; fractions are of 1."""
+    """Reads colors, [n, 3] uint8; fractions are of 1."""
     names = ("red", "green", "blue")
     if not all(name in (table.dtype.names or ()) for name in names):
         return np.full((len(table), 3), _GRAY, np.uint8)

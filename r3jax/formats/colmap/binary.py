@@ -67,13 +67,13 @@ class _Cursor:
         self._at = 0
 
     def take(self, kind: struct.Struct) -> tuple[int | float, ...]:
-        """Returns the next numbers."""
+        """Reads the next numbers."""
         self._check(kind.size)
         self._at += kind.size
         return kind.unpack_from(self._data, self._at - kind.size)
 
     def count(self, what: str, size: int) -> int:
-        """Returns the number of rows that follow, of at least `size` bytes each."""
+        """Reads the number of rows that follow, of at least `size` bytes each."""
         count = int(self.take(_COUNT)[0])
         left = len(self._data) - self._at
         if count * size > left:
@@ -83,14 +83,14 @@ class _Cursor:
         return count
 
     def table(self, kind: np.dtype, count: int) -> np.ndarray:
-        """Returns the next `count` rows; `count` has been checked."""
+        """Reads the next `count` rows; `count` has been checked."""
         self._check(count * kind.itemsize)
         found = np.frombuffer(self._data, kind, count, self._at)
         self._at += count * kind.itemsize
         return found
 
     def text(self) -> str:
-        """Returns the bytes up to the next zero byte, as a file's name."""
+        """Reads the bytes up to the next zero byte, as a file's name."""
         end = self._data.find(b"\0", self._at, self._at + _LONGEST_NAME + 1)
         if end < 0:
             raise ForeignFileError(f"an image's name at byte {self._at} has no end")

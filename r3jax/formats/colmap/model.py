@@ -84,7 +84,7 @@ class ColmapModel:
 
 
 def points_without_tracks(xyz: np.ndarray, rgb: np.ndarray) -> ColmapPoints:
-    """Returns points that no image is known to see, numbered from 1.
+    """Makes points whose images are not known, numbered from 1.
 
     Args:
         xyz: [m, 3].
@@ -103,7 +103,7 @@ def points_without_tracks(xyz: np.ndarray, rgb: np.ndarray) -> ColmapPoints:
 
 
 def pose_of(quaternion: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    """Returns `T_world_camera` [4, 4] float64 of COLMAP's world-to-camera pose.
+    """Converts COLMAP's world-to-camera pose to `T_world_camera` [4, 4] float64.
 
     Raises:
         ForeignFileError: see `rotation_of`; a translation that is not finite, or too far away.
@@ -118,9 +118,9 @@ def pose_of(quaternion: np.ndarray, translation: np.ndarray) -> np.ndarray:
 
 
 def colmap_pose(T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns COLMAP's quaternion [4] and translation [3] of a pose [4, 4].
+    """Converts a pose [4, 4] to COLMAP's quaternion [4] and translation [3].
 
-    Inverse of `pose_of`.
+    This is the inverse of `pose_of`.
     """
     quaternion = quaternion_of(T_world_camera[:3, :3].T)
     return quaternion, -rotation_of(quaternion) @ T_world_camera[:3, 3].astype(np.float64)

@@ -30,7 +30,7 @@ and of fractions (FULL_OPENCV) may be larger."""
 
 
 def find_model(path: Path) -> Path | None:
-    """Returns the folder of the model in a capture's folder, None if there is none."""
+    """Finds the folder of the model in a capture's folder; None if there is none."""
     for name in _MODEL_FOLDERS:
         folder = path / name
         if any((folder / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
@@ -98,7 +98,7 @@ def read_colmap(path: Path | str, images: Path | str | None = None) -> PosedImag
 
 
 def _parts(path: Path, folder: Path) -> list[Path]:
-    """Returns COLMAP numbers its models, one for every part of a capture that it could not join.
+    """Finds all numbered models of a capture.
 
     A part without its images is left out where another one is whole: some keep only a piece of it.
     """
@@ -109,7 +109,7 @@ def _parts(path: Path, folder: Path) -> list[Path]:
 
 
 def _numbered(folder: Path) -> list[Path]:
-    """Returns the model and those of other numbers beside it."""
+    """Lists the model and those of other numbers beside it."""
     found = [part for part in folder.parent.iterdir() if part.name.isdecimal()]
     return sorted((p for p in found if find_model(p) == p), key=lambda p: int(p.name))
 
@@ -121,7 +121,7 @@ def _has_images(folder: Path) -> bool:
 def _left_out(
     folder: Path, models: Mapping[Path, ColmapModel], image_paths: tuple[Path, ...]
 ) -> str | None:
-    """Returns a sentence on the other models and the images that this one has no pose for."""
+    """Describes the other models, and the images without a pose in this one."""
     posed = set(image_paths)
     suffixes = {path.suffix for path in posed}
     beside = {file for place in {path.parent for path in posed} for file in _files(place)}
@@ -145,10 +145,7 @@ def _left_out(
 
 
 def _odd_lenses(model: ColmapModel) -> list[str]:
-    """Returns says which lens cannot be true.
-
-    Then the poses and points, fitted with it, are not either.
-    """
+    """Names an implausible lens: poses and points that were fitted with it are wrong, too."""
     odd = [
         f"camera {number} (focal length {max(lens.intrinsics[:2]):.0f} px, distortion "
         f"{max(map(abs, lens.distortion.values()), default=0.0):.3g})"

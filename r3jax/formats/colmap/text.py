@@ -85,7 +85,7 @@ def _is_row(line: _Line) -> bool:
 
 
 def _parsed(line: _Line, parse: Callable[[str], T]) -> T:
-    """Returns what a line says; errors get its number."""
+    """Parses a line; errors get its number."""
     try:
         return parse(line[1])
     except (ValueError, OverflowError) as error:
@@ -186,7 +186,7 @@ def _points(rows: Sequence[_Point]) -> ColmapPoints:
 
 
 def _joined(*values: object) -> str:
-    """Returns numbers with all their digits: what is read is what was written."""
+    """Joins numbers with all their digits, so that reading restores them exactly."""
     return " ".join(str(value) for value in values)
 
 

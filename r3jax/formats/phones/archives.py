@@ -108,7 +108,7 @@ class Archive:
             return image_pixels(data, IMAGE_FORMATS, size)
 
     def size(self, name: str) -> tuple[int, int]:
-        """Returns the width and height of an image [px].
+        """Reads the width and height of an image [px].
 
         Raises:
             FormatError: missing, or damaged.
@@ -139,7 +139,7 @@ class Archive:
 
 
 def _unpack(archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
-    """Returns one member, that must be as long as it says."""
+    """Reads one member, whose length must be the recorded one."""
     info = archive.NameToInfo.get(name)
     if info is None:
         raise ForeignFileError("the file is missing in the archive")
@@ -184,9 +184,9 @@ def find_archive(path: Path, *marks: str) -> Archive | None:
 
 
 def _tops(zipped: zipfile.ZipFile, mark: str) -> set[str]:
-    """Returns where in an archive a file or a folder of this name is.
+    """Finds where in an archive a file or a folder of this name is.
 
-    At its top, or in a folder there.
+    It is at the top, or in a folder there.
     """
     found: set[str] = set()
     for name in zipped.NameToInfo:

@@ -93,7 +93,7 @@ def _shot(archive: Archive, name: str, camera: str, pose: np.ndarray) -> Shot:
 
 
 def _trajectory(archive: Archive) -> tuple[np.ndarray, np.ndarray]:
-    """Returns times [n] and poses `T_world_camera` [n, 4, 4]."""
+    """Reads times [n] and poses `T_world_camera` [n, 4, 4]."""
     table = read_numbers(archive.where(_TRAJECTORY), 7, archive.read(_TRAJECTORY))
     if not np.all(np.isfinite(table)) or np.abs(table).max() > 1e12:
         raise ForeignFileError("there are numbers that are not finite or far too large")
@@ -104,7 +104,7 @@ def _trajectory(archive: Archive) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _time(name: str) -> float:
-    """Returns seconds in a name such as 40753679_6791.528; NaN is never near a pose."""
+    """Reads the seconds in a name such as 40753679_6791.528; NaN if it has none."""
     try:
         return float(name.rpartition("_")[2])
     except ValueError:
@@ -112,7 +112,7 @@ def _time(name: str) -> float:
 
 
 def _camera_name(name: str, cameras: set[str]) -> str | None:
-    """Returns the camera of an image, whose time may be a millisecond off."""
+    """Finds the camera of an image, whose time may be a millisecond off."""
     video, _, _ = name.rpartition("_")
     candidates = [f"{video}_{_time(name) + off:.3f}" for off in _MILLISECONDS]
     return next((one for one in (name, *candidates) if one in cameras), None)

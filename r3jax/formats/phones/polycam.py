@@ -82,7 +82,7 @@ def read_polycam(path: Path | str) -> PosedImages:
 
 
 def _shot(archive: Archive, kind: str, name: str) -> Shot:
-    """Returns one frame; `kind` begins the names of the folders."""
+    """Reads one frame; the names of its folders begin with `kind`."""
     source = f"keyframes/{kind}cameras/{name}.json"
     camera = archive.json(source)
     with naming(archive.where(source)):

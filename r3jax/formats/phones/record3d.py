@@ -62,7 +62,7 @@ def is_record3d(path: Path) -> bool:
 
 
 def _export(path: Path) -> Archive | None:
-    """Returns the export EXR + JPG in a folder or archive."""
+    """Finds the export EXR + JPG in a folder or archive."""
     archive = find_archive(path, *_EXPORT)
     return archive if archive is not None and archive.names("depth", ".exr") else None
 
@@ -117,25 +117,25 @@ def read_record3d(path: Path | str) -> PosedImages:
 
 
 def _files(index: int) -> tuple[str, str, str]:
-    """Returns the image, depth and confidence of a frame in an .r3d archive."""
+    """Names the image, depth and confidence of a frame in an .r3d archive."""
     return f"rgbd/{index}.jpg", f"rgbd/{index}.depth", f"rgbd/{index}.conf"
 
 
 def _exported_files(archive: Archive, index: int) -> tuple[str, str, str]:
-    """Returns the same in an export, which has no confidence."""
+    """Names the files of a frame in an export, which has no confidence."""
     image = f"rgb/{index}.jpg"
     return image if archive.has(image) else f"rgb/{index}.png", f"depth/{index}.exr", ""
 
 
 def _exported_depth(archive: Archive, shot: Shot) -> np.ndarray:
-    """Returns z-depth [h, w] float32 [m]."""
+    """Reads z-depth [h, w] float32 [m]."""
     data = archive.read(shot.depth, _MAX_EXR)
     with naming(archive.where(shot.depth)):
         return MILLIMETERS.depth(stored_depth(data))
 
 
 def _lenses(metadata: dict[str, Any]) -> list[Lens]:
-    """Returns one for each pose."""
+    """Makes one lens for each pose."""
     width, height, K = metadata["w"], metadata["h"], metadata["K"]
     if len(K) != 9:
         raise ForeignFileError(f"`K` must have 9 numbers, got {len(K)}")
@@ -147,7 +147,7 @@ def _lenses(metadata: dict[str, Any]) -> list[Lens]:
 
 
 def _depth_size(metadata: dict[str, Any]) -> tuple[int, int] | None:
-    """Returns rows and columns of the depth images, where the file says them."""
+    """Reads the rows and columns of the depth images, if the file contains them."""
     if "dw" not in metadata or "dh" not in metadata:
         return None
     check_fields("metadata", metadata, {"dw": int, "dh": int})
@@ -158,7 +158,7 @@ def _depth_size(metadata: dict[str, Any]) -> tuple[int, int] | None:
 
 
 def _depth(archive: Archive, decoder: Any, size: tuple[int, int] | None, shot: Shot) -> np.ndarray:
-    """Returns z-depth [h, w] float32 where the sensor was sure."""
+    """Reads z-depth [h, w] float32 where the sensor was confident."""
     data = archive.read(shot.depth, _MAX_BYTES)
     with naming(archive.where(shot.depth)):
         sizes = _DEPTH_SIZES if size is None else (size,)

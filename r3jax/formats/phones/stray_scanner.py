@@ -106,7 +106,7 @@ class Video:
         raise FormatError(self._path, f"the video ends before frame {number}")
 
     def _from(self, number: int) -> Iterator[Any]:
-        """Yields frames from the key frame before a frame on."""
+        """Yields frames, from the last key frame before a frame on."""
         self._container.seek(self._times[number], stream=self._stream)
         yield from self._container.decode(self._stream)
 
@@ -173,7 +173,7 @@ def read_stray_scanner(path: Path | str) -> PosedImages:
 
 
 def _shot(archive: Archive, video: Video, row: np.ndarray, params: np.ndarray) -> Shot:
-    """Returns one frame of a row [8] of the table and its intrinsics [4]."""
+    """Makes one frame of a row [8] of the table and its intrinsics [4]."""
     number = int(row[0])
     if number != row[0] or number < 0:
         raise ForeignFileError(f"{row[0]:g} is no number of a frame")
@@ -188,7 +188,7 @@ def _shot(archive: Archive, video: Video, row: np.ndarray, params: np.ndarray) -
 
 
 def _video(archive: Archive) -> Video:
-    """Returns the video, from the disk where it lies there."""
+    """Opens the video, from the disk if it lies there."""
     name = archive.where(_VIDEO)
     if archive.zipped is not None:
         return Video(name, archive.read(_VIDEO, _MAX_VIDEO))
@@ -198,9 +198,9 @@ def _video(archive: Archive) -> Video:
 
 
 def _table(archive: Archive) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the columns of odometry.csv: frame and pose [n, 8], and intrinsics [n, 4]; NaN.
+    """Reads odometry.csv: frame and pose [n, 8], and intrinsics [n, 4].
 
-    Not known.
+    Unknown values are NaN.
 
     Raises:
         ForeignFileError: no such columns, no rows, or a field that is no number.
@@ -224,7 +224,7 @@ def _table(archive: Archive) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _number(word: str, which: str) -> float:
-    """Returns a field; NaN where it is empty."""
+    """Reads a field; NaN where it is empty."""
     try:
         value = float(word) if word else 0.0
     except ValueError:
@@ -235,7 +235,7 @@ def _number(word: str, which: str) -> float:
 
 
 def _camera_matrix(archive: Archive) -> np.ndarray:
-    """Returns fx, fy, cx, cy of all frames, [4]."""
+    """Reads fx, fy, cx, cy of all frames, [4]."""
     name = "camera_matrix.csv"
     K = read_matrix(archive.where(name), 3, 3, archive.read(name).replace(b",", b" "))
     return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
