@@ -44,16 +44,16 @@ _ON_HOST = (1, 3)
 
 
 def _as_image(image: ArrayLike) -> Array:
-    """Returns half and double precision become float32; integers stay, to be refused by name."""
+    """Converts half and double precision to float32; integers stay, to be refused by name."""
     array = jnp.asarray(image)
     # Cast to float, 8-bit colors would be 255 times too bright and millimeters too far.
     return array.astype(jnp.float32) if jnp.issubdtype(array.dtype, jnp.floating) else array
 
 
 def _as_pose(pose: ArrayLike) -> Array:
-    """Returns the single precision.
+    """Converts a pose to single precision.
 
-    Under jit, where it cannot be refused, a pose that is not rigid is NaN.
+    Under jit, where it cannot be refused, a pose that is not rigid becomes NaN.
     """
     T = jnp.asarray(pose, dtype=jnp.float32)
     # A wrong shape is refused by `_check_structure`, a known value by `_check_values`.
@@ -136,7 +136,7 @@ class Frame(eqx.Module):
         ignore: Any = None,
         far: bool = False,
     ) -> "Frame":
-        """Returns a frame from the arrays of another program.
+        """Makes a frame from the arrays of another program.
 
         Arrays are NumPy's, JAX's, or anything with `__dlpack__`: a PyTorch tensor on the CPU, or
         on a device that JAX uses too. They are copied; their memory may be written again.
@@ -243,7 +243,7 @@ a_frame = one(Frame, "Frame.from_arrays makes one of arrays", leaf="depth", ndim
 
 
 def as_array(name: str, value: Any) -> np.ndarray | Array:
-    """Returns an array of any of the known kinds, as NumPy's if it lies in ordinary memory.
+    """Converts a known kind of array, to NumPy's if it lies in ordinary memory.
 
     Args:
         name: what the caller calls it, for errors.
@@ -308,7 +308,7 @@ def color_image(rgb: Any) -> Float[Array, "H W 3"]:
 
 
 def _hint(shape: tuple[int, ...]) -> str:
-    """Returns what to do about the shapes that other libraries prefer."""
+    """Suggests how to mend the shapes that other libraries prefer."""
     if len(shape) == 3 and shape[2] == 4:
         return ": leave out alpha, rgb[..., :3]"
     if len(shape) == 3 and shape[0] == 3:
@@ -348,7 +348,7 @@ def depth_image(depth: Any, metres_per_step: float | int | None = None) -> Float
 
 
 def pinhole_camera(camera: Any, height: int, width: int, pixel_center: float | int) -> Camera:
-    """Returns a camera from a matrix of intrinsics; a `Camera` as it is.
+    """Makes a camera from a matrix of intrinsics; returns a `Camera` as it is.
 
     Args:
         camera: a `Camera`, or [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
@@ -384,7 +384,7 @@ def pinhole_camera(camera: Any, height: int, width: int, pixel_center: float | i
 
 
 def without(depth: Float[Array, "H W"], ignore: Any) -> Float[Array, "H W"]:
-    """Returns the depth without the pixels of a mask, which become 0: no measurement.
+    """Removes the pixels of a mask from the depth: they become 0, no measurement.
 
     Args:
         depth: z-depth [m].
@@ -404,7 +404,7 @@ def without(depth: Float[Array, "H W"], ignore: Any) -> Float[Array, "H W"]:
 
 
 def to_camera_to_world(pose: Any, convention: str) -> Any:
-    """Returns the camera-to-world pose in OpenCV axes of one in another convention.
+    """Converts a pose to camera-to-world in OpenCV axes.
 
     Args:
         pose: a matrix [4, 4], NumPy's or JAX's; of another shape it stays as it is, to be refused.
@@ -428,7 +428,7 @@ def to_camera_to_world(pose: Any, convention: str) -> Any:
 
 
 def own_matrix(name: str, value: Any) -> np.ndarray | Array:
-    """Returns a small matrix whose memory is not the caller's.
+    """Copies a small matrix, so that its memory is not the caller's.
 
     Raises:
         TypeError: not an array.
@@ -438,7 +438,7 @@ def own_matrix(name: str, value: Any) -> np.ndarray | Array:
 
 
 def _float32(array: np.ndarray | Array) -> np.ndarray | Array:
-    """Returns the same numbers in memory of their own."""
+    """Copies an array to float32 in memory of its own."""
     if isinstance(array, np.ndarray):
         return np.array(array, dtype=np.float32)
     return array.astype(jnp.float32)

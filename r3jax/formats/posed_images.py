@@ -60,7 +60,7 @@ class SparsePoints:
         return len(self.xyz)
 
     def seen_by(self, image: int) -> np.ndarray:
-        """Returns indices of the points that an image sees, ascending."""
+        """Finds the indices of the points that an image sees, ascending."""
         return np.unique(self.seen_point[self.seen_image == image])
 
 
@@ -125,7 +125,7 @@ class PosedImages:
         return len(self.image_paths)
 
     def with_depth(self, folder: Path, unit: DepthUnit) -> "PosedImages":
-        """Returns the same images with the depth images of a folder: 16-bit PNGs of the same names.
+        """Adds the depth images of a folder: 16-bit PNGs of the images' names.
 
         For formats that have no place for depth. Images without a PNG there have no depth.
         """
@@ -191,7 +191,7 @@ class PosedImages:
             raise FormatError(depth_path, str(error)) from None
 
     def rgb(self, index: int) -> np.ndarray:
-        """Returns the pixels of one image as they are, distortion included, [H, W, 3] uint8.
+        """Reads the pixels of one image as they are, distortion included, [H, W, 3] uint8.
 
         Raises:
             FormatError: the file is missing, broken or of another size.
@@ -199,7 +199,7 @@ class PosedImages:
         return self.masked_rgb(index)[0]
 
     def masked_rgb(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """Returns the pixels of one image, and which of them its alpha channel does not cut out.
+        """Reads the pixels of one image, and which of them its alpha channel keeps.
 
         Returns:
             [H, W, 3] uint8 as `rgb`, and [H, W] bool; None: all of them count.
@@ -214,7 +214,7 @@ class PosedImages:
             return masked_pixels(path, IMAGE_FORMATS, (lens.width, lens.height))
 
     def depth(self, index: int) -> np.ndarray | None:
-        """Returns the depth of one image, pixel by pixel as in `rgb`, [H, W] float32; None without.
+        """Reads the depth of one image, pixel by pixel as in `rgb`, [H, W] float32; None without.
 
         0 is no measurement, inf nothing within range.
 
@@ -233,7 +233,7 @@ class PosedImages:
         return resample_depth(stored, self.lenses[index], own)
 
     def frames(self) -> Iterator[Frame]:
-        """Returns every frame in order, read one by one."""
+        """Yields every frame in order, read one by one."""
         return (self.frame(index) for index in range(len(self)))
 
 
@@ -275,7 +275,7 @@ def find_images(places: Iterable[Path], names: Mapping[str, Lens]) -> Path | Non
 
 
 def _fits(folder: Path, there: list[str], names: Mapping[str, Lens]) -> bool:
-    """Returns True if the first image that can be opened has the shape of its lens."""
+    """Checks whether the first image that can be opened has the shape of its lens."""
     with suppress(ForeignFileError, OSError):
         size = first_size((folder / name for name in there), IMAGE_FORMATS)
         return names[there[0]].has_shape(*size)
@@ -315,7 +315,7 @@ def pair_images(
 
 
 def left_out(count: int, total: int, frames: str = "frames") -> str | None:
-    """Returns a sentence on frames that are left out; None where there are none.
+    """Describes the frames that are left out, in a sentence; None if there are none.
 
     Args:
         count: of those that are left out.

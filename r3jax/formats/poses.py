@@ -79,7 +79,7 @@ def read_lines(path: Path, data: bytes | None = None) -> Iterator[tuple[int, lis
 
 
 def to_floats(path: Path, number: int, words: list[str], columns: int) -> list[float]:
-    """Returns the numbers of one line.
+    """Parses the numbers of one line.
 
     Raises:
         FormatError: another number of words, or one that is no number.
@@ -93,7 +93,7 @@ def to_floats(path: Path, number: int, words: list[str], columns: int) -> list[f
 
 
 def read_numbers(path: Path, columns: int, data: bytes | None = None) -> np.ndarray:
-    """Returns a table of numbers, [n, columns] float64, n >= 1; `data` as in `read_lines`.
+    """Reads a table of numbers, [n, columns] float64, n >= 1; `data` as in `read_lines`.
 
     Raises:
         FormatError: the file is missing, holds no numbers, or a line has another number of them.
@@ -106,7 +106,7 @@ def read_numbers(path: Path, columns: int, data: bytes | None = None) -> np.ndar
 
 
 def read_matrix(path: Path, rows: int, columns: int, data: bytes | None = None) -> np.ndarray:
-    """Returns a matrix of this shape, float64; `data` as in `read_lines`.
+    """Reads a matrix of this shape, float64; `data` as in `read_lines`.
 
     Raises:
         FormatError: the file is missing, or holds something else.
@@ -139,7 +139,7 @@ def up_of_poses(poses: np.ndarray) -> np.ndarray | None:
 
 
 def nearest(times: np.ndarray, others: np.ndarray, max_gap: float) -> np.ndarray:
-    """Returns the for each time the index of the nearest other time; -1 where it is too far away.
+    """Finds the index of the time nearest to each time; -1 if none is close enough.
 
     Args:
         times: [n] [s], in any order.
@@ -156,9 +156,9 @@ def nearest(times: np.ndarray, others: np.ndarray, max_gap: float) -> np.ndarray
 
 
 def rotation_of(quaternion: np.ndarray) -> np.ndarray:
-    """Returns the rotation matrix [3, 3] of a quaternion w x y z [4].
+    """Converts a quaternion w x y z [4] to a rotation matrix [3, 3].
 
-    Rounding of its length is mended.
+    A length that differs from 1 by rounding is corrected.
 
     Raises:
         ForeignFileError: not finite, or not of unit length.
@@ -170,7 +170,7 @@ def rotation_of(quaternion: np.ndarray) -> np.ndarray:
 
 
 def quaternion_of(R: np.ndarray) -> np.ndarray:
-    """Returns the quaternion w x y z [4] of a rotation matrix [3, 3], with w >= 0."""
+    """Converts a rotation matrix [3, 3] to a quaternion w x y z [4], with w >= 0."""
     return Rotation.from_matrix(R).as_quat(canonical=True, scalar_first=True)
 
 

@@ -229,7 +229,7 @@ def submission_of_run(run: Run) -> Submission:
 
 
 def _frames_of(rows: Sequence[StepRow]) -> tuple[SubmittedFrame, ...]:
-    """Returns the frames of a trace, each with the piece of the path that leads to it."""
+    """Collects the frames of a trace, each with the piece of the path that leads to it."""
     return tuple(
         SubmittedFrame(
             frame=row.step,
@@ -255,7 +255,7 @@ def write_submission(path: Path, submission: Submission) -> None:
 
 
 def submission_text(submission: Submission) -> str:
-    """Returns the lines of the file."""
+    """Writes the lines of the file."""
     first = {"format": FORMAT, "version": VERSION, "protocol": PROTOCOL} | vars(submission)
     del first["frames"]
     lines = [first, *(_plain(frame) for frame in submission.frames)]
@@ -265,7 +265,7 @@ def submission_text(submission: Submission) -> str:
 
 
 def _plain(frame: SubmittedFrame) -> dict[str, Any]:
-    """Returns a frame as JSON has it; what is at its default is left out."""
+    """Converts a frame to plain JSON values, without those at their defaults."""
     plain = {
         item.name: getattr(frame, item.name)
         for item in dataclasses.fields(SubmittedFrame)
@@ -324,7 +324,7 @@ def parse_submission(data: bytes) -> Submission:
 
 
 def _header_of(plain: Any) -> dict[str, Any]:
-    """Returns the fields of the first line, but for what says that it is one."""
+    """Reads the fields of the first line, except for format and versions."""
     if not isinstance(plain, dict) or plain.get("format") != FORMAT:
         raise ForeignFileError(f"this is no submission (no format {FORMAT!r})")
     check_version(plain.get("version"), VERSION)
@@ -363,7 +363,7 @@ def _check_parts(header: Submission) -> None:
 
 
 def _frame_of(plain: Any, number: int) -> SubmittedFrame:
-    """Returns a frame of its line; `number` is that of the frame that comes next."""
+    """Reads a frame from its line; `number` is that of the next frame."""
     known: dict[str, Any] = plain if isinstance(plain, dict) else {}
     if known and known.get("pose") is None:
         raise ForeignFileError("the frame is missing `pose`")
@@ -379,7 +379,7 @@ def _frame_of(plain: Any, number: int) -> SubmittedFrame:
 
 
 def content_hash(submission: Submission) -> str:
-    """Returns SHA-256 of what a submission says, wherever its file and that of its scene lie."""
+    """Hashes the content of a submission by SHA-256, without the paths of files."""
     # The scene is known by the hash of what it shows, not by its name.
     nowhere = dataclasses.replace(submission, scene=submission.scene | {"name": ""})
     return hashlib.sha256(submission_text(nowhere).encode()).hexdigest()

@@ -53,7 +53,7 @@ def checked(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
 
 def one(kind: type, hint: str, leaf: str = "", ndim: int = 0) -> Check:
-    """Returns checks that an argument is one object of a kind, not an array nor several stacked.
+    """Checks that an argument is one object of a kind, not an array nor several stacked.
 
     Args:
         kind: its class.
@@ -137,7 +137,7 @@ def points_of_3(name: str, value: Any) -> None:
 
 
 def describe(value: Any) -> str:
-    """Returns what an argument is, for errors."""
+    """Describes an argument, for errors."""
     shape = getattr(value, "shape", None)
     return type(value).__name__ if shape is None else f"an array of shape {tuple(shape)}"
 

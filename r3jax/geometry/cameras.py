@@ -82,7 +82,7 @@ class Camera(eqx.Module):
         return jnp.sqrt(self.fx * self.fy)
 
     def resized(self, width: int, height: int) -> "Camera":
-        """Returns the same field of view sampled by another number of pixels."""
+        """Returns a camera of the same field of view with another number of pixels."""
         # Edges lie at 0 and at the size, so the principal point scales without half-pixel shifts.
         sx, sy = width / self.width, height / self.height
         return Camera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
@@ -127,7 +127,7 @@ def pixel_rays(camera: Camera) -> Float[Array, "H W 3"]:
 
 
 def unproject(camera: Camera, depth: Float[Array, "H W"]) -> Float[Array, "H W 3"]:
-    """Returns points in the camera's frame [m] of a z-depth image [m]."""
+    """Computes points in the camera's frame [m] from a z-depth image [m]."""
     return pixel_rays(camera) * depth[..., None]
 
 
@@ -140,7 +140,7 @@ def transform(T: Float[Array, "4 4"], points: Float[Array, "*n 3"]) -> Float[Arr
 
 
 def invert_pose(T: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
-    """Returns the inverse of a rigid transform, by transposing its rotation."""
+    """Inverts a rigid transform by transposing its rotation."""
     # The transpose, not a solver: exact for rotations, and no pivots under vmap.
     R_inverse = T[:3, :3].T
     t_inverse = -R_inverse @ T[:3, 3]
@@ -151,7 +151,7 @@ def invert_pose(T: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
 def pose_along(
     position: Num[Array | np.ndarray, " 3"], direction: Num[Array | np.ndarray, " 3"]
 ) -> Float[Array, "4 4"]:
-    """Returns the roll-free pose at `position` that looks along `direction`.
+    """Makes the roll-free pose at `position` that looks along `direction`.
 
     The image's x axis stays level. Looking straight up or down, level is ambiguous: the x axis
     is then the world's x axis.
@@ -190,7 +190,7 @@ def pose_along(
 def look_at(
     position: Num[Array | np.ndarray, " 3"], target: Num[Array | np.ndarray, " 3"]
 ) -> Float[Array, "4 4"]:
-    """Returns the roll-free pose at `position` that looks at the point `target` (both [m], world).
+    """Makes the roll-free pose at `position` that looks at `target` (both [m], world).
 
     Raises:
         ValueError: shapes other than [3], what is not finite, or one and the same point.
@@ -213,7 +213,7 @@ def _point(name: str, value: ArrayLike) -> Float[Array, " 3"]:
 
 
 def angle_between(first: np.ndarray, second: np.ndarray) -> float:
-    """Returns the angle of the rotation between two poses, [4, 4] each [rad]. On the host."""
+    """Computes the angle of the rotation between two poses, [4, 4] each [rad]. On the host."""
     # Clipped below: rounding may put the cosine of no turn above 1.
     cosine = 0.5 * (np.trace(first[:3, :3].T @ second[:3, :3]) - 1.0)
     return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
@@ -278,7 +278,7 @@ def nan_unless_valid(
 
 
 def is_rigid(T: Float[Array, "4 4"]) -> Bool[Array, ""]:
-    """Returns True for a pose in which `rigid_error` finds nothing wrong."""
+    """Checks that `rigid_error` finds nothing wrong with a pose."""
     R = T[:3, :3].astype(jnp.float32)
     # Not a matrix product: on some devices those round to ten bits.
     deviation = jnp.sum(R[:, None, :] * R[None, :, :], axis=2) - jnp.eye(3)
@@ -293,5 +293,5 @@ def is_rigid(T: Float[Array, "4 4"]) -> Bool[Array, ""]:
 
 
 def is_traced(*arrays: object) -> bool:
-    """Returns True if any of the arrays is a tracer, so that its values cannot be looked at."""
+    """Returns True if any of the arrays is a tracer, whose values cannot be read."""
     return any(isinstance(x, Tracer) for x in arrays)

@@ -5,7 +5,7 @@ from jaxtyping import Array, Float
 
 
 def safe_norm(x: Float[Array, "..."], axis: int = -1) -> Float[Array, "..."]:
-    """Returns the euclidean length along `axis`; the gradient at the zero vector is 0, not NaN."""
+    """Computes the Euclidean length along `axis`; its gradient at the zero vector is 0, not NaN."""
     squared = jnp.sum(x * x, axis=axis)
     is_zero = squared == 0.0
     # Replaced before the root, not after: the gradient of sqrt at 0 is infinite, and times the
@@ -15,7 +15,7 @@ def safe_norm(x: Float[Array, "..."], axis: int = -1) -> Float[Array, "..."]:
 
 
 def safe_power(base: Float[Array, "..."], exponent: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Returns `base ** exponent` for `base >= 0` and `exponent >= 0`, with `0 ** 0 = 1`.
+    """Computes `base ** exponent` for `base >= 0` and `exponent >= 0`, with `0 ** 0 = 1`.
 
     At base 0 the plain gradient is infinite for exponents below 1 (and for the exponent's own
     `log(0)`). Here both gradients are 0 there: the value is the constant 0 (or 1) nearby in
@@ -33,7 +33,7 @@ def safe_power(base: Float[Array, "..."], exponent: Float[Array, "..."]) -> Floa
 def safe_divide(
     numerator: Float[Array, "..."], denominator: Float[Array, "..."]
 ) -> Float[Array, "..."]:
-    """Returns `numerator / denominator`, and 0 where the denominator is 0."""
+    """Computes `numerator / denominator`, and 0 where the denominator is 0."""
     is_zero = denominator == 0.0
     # An infinite quotient in the branch not taken would make the gradient NaN.
     denominator_safe = jnp.where(is_zero, 1.0, denominator)

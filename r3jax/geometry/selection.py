@@ -24,9 +24,7 @@ SPARE = 64
 
 
 def spare_places(size: int, num: int) -> Int[Array, " n"]:
-    """Returns where to scatter what shall be dropped.
-
-    `num` indices of the places behind `size` others.
+    """Returns `num` indices of spare places after `size` others, for items that a scatter drops.
 
     On CPUs XLA bounds-checks every element; where the outcome is random, half of the branches are
     mispredicted, which costs more than the write. A write that is always in bounds costs nothing,
@@ -36,7 +34,7 @@ def spare_places(size: int, num: int) -> Int[Array, " n"]:
 
 
 def running_count(flags: Bool[Array, " n"]) -> Int[Array, " n"]:
-    """Returns the number of set flags up to and including each place. n < 2^24."""
+    """Counts the set flags up to and including each place. n < 2^24."""
     # float32 has every integer up to 2^24; beyond, counts would be rounded.
     if flags.shape[0] >= 1 << 24:
         raise InputError(f"running_count is exact below 2^24 flags, got {flags.shape[0]}")
@@ -58,7 +56,7 @@ def _inclusive_sum(x: Array) -> Array:
 
 
 def positions_of_set(flags: Bool[Array, " n"], size: int) -> Int[Array, " M"]:
-    """Returns indices of the first `size` set flags, in order; n pads.
+    """Finds the indices of the first `size` set flags, in order; n pads.
 
     Like `jnp.nonzero(flags, size=size, fill_value=n)`, but quick.
     """

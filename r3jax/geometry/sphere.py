@@ -31,7 +31,7 @@ def _lattice(num: int) -> np.ndarray:
 
 
 def fibonacci_lattice(num: int) -> np.ndarray:
-    """Returns `num` nearly even unit directions, [num, 3] float64.
+    """Computes `num` nearly even unit directions, [num, 3] float64.
 
     z_k = 1 - 2 (k + 0.5) / num, azimuth 2 pi k / golden ratio, k = 0..num-1 (arXiv 2601.07484,
     whose k = 1..num would leave the sphere).
@@ -42,7 +42,7 @@ def fibonacci_lattice(num: int) -> np.ndarray:
 
 
 def bins_for_angle(angle_deg: float | int) -> int:
-    """Returns the number of bins so that each covers a cap of the full opening `angle_deg` [deg].
+    """Computes the number of bins whose caps have the full opening `angle_deg` [deg].
 
     A = 2 pi (1 - cos(angle / 2)), num = ceil(4 pi / A); 10 degrees give 526.
     """
@@ -54,7 +54,7 @@ def bins_for_angle(angle_deg: float | int) -> int:
 
 
 def octahedral_cell(directions: Float[Array, "3 n"], size: int) -> Int[Array, " n"]:
-    """Returns the cell (row * size + column) of each direction on the octahedral map of the sphere.
+    """Finds the cell (row * size + column) of each direction on the octahedral map.
 
     The octahedron |x| + |y| + |z| = 1 is unfolded into a square: the upper half is its middle,
     the lower half its four corners (Cigolle et al. 2014). Directions need not have length 1.
@@ -123,7 +123,7 @@ def nearest_bin_table(num: int) -> np.ndarray:
 
 
 def nearest_bin(directions: Float[Array, "3 n"], num: int) -> Int[Array, " n"]:
-    """Returns the index of the lattice direction nearest to each unit direction; ties go to either.
+    """Finds the lattice direction nearest to each unit direction; ties go to either.
 
     A table over the octahedral map leaves a few candidates per direction, so that the cost does
     not grow with `num`.

@@ -39,9 +39,9 @@ def check_near_origin(name: str, points: np.ndarray, limit: float = MAX_COORDINA
 def voxel_index(
     coordinates: Float[Array, "..."], voxel_size: Float[Array, ""]
 ) -> Int[Array, "..."]:
-    """Returns the index of the voxel along each coordinate.
+    """Computes the index of the voxel along each coordinate, floor(p / size).
 
-    Floor(p / size), voxel 0 spanning [0, size).
+    Voxel 0 spans [0, size).
     """
     # Truncation would make the voxel at 0 twice as wide, reaching to both sides.
     index = jnp.floor(coordinates / voxel_size)
@@ -51,7 +51,7 @@ def voxel_index(
 
 
 def voxel_center(index: Int[Array, "..."], voxel_size: Float[Array, ""]) -> Float[Array, "..."]:
-    """Returns the center of the voxel along each coordinate [m]."""
+    """Computes the center of the voxel along each coordinate [m]."""
     return (index.astype(jnp.float32) + 0.5) * voxel_size
 
 
@@ -72,7 +72,10 @@ def pack(
 def unpack(
     low: UInt32[Array, "*n"], high: UInt32[Array, "*n"]
 ) -> tuple[Int[Array, "*n"], Int[Array, "*n"], Int[Array, "*n"]]:
-    """Returns the inverse of `pack`. Empty rows give indices that mean nothing."""
+    """Unpacks the indices from a key: the inverse of `pack`.
+
+    Empty rows give indices without meaning.
+    """
     mask21 = jnp.uint32((1 << 21) - 1)
     ux = low & mask21
     uy = (low >> 21) | ((high & jnp.uint32((1 << 10) - 1)) << 11)

@@ -59,7 +59,7 @@ class Cells(NamedTuple):
     """False for cells that are known, and for padding."""
 
     def take(self, index: Int[Array, " k"], valid: Bool[Array, " k"]) -> "Cells":
-        """Returns the cells at `index`; not unexplored where `valid` is False."""
+        """Gathers the cells at `index`; not unexplored where `valid` is False."""
         part = (self.x[index], self.y[index], self.z[index])
         return Cells(*part, valid & self.unexplored[index])
 
@@ -493,13 +493,13 @@ def _workers() -> np.ndarray:
 
 
 def _options(*values: int) -> np.ndarray:
-    """Returns the whole numbers of a call, and how many threads share it."""
+    """Joins the whole numbers of a call and the number of threads that share it."""
     return np.append(np.array(values, dtype=np.int32), _workers())
 
 
 @functools.cache
 def _lattice(num_bins: int) -> np.ndarray:
-    """Returns directions of bins [B, 3]."""
+    """Returns the directions of bins [B, 3]."""
     return fibonacci_lattice(num_bins).astype(np.float32)
 
 

@@ -59,11 +59,11 @@ class ImageTimes:
         return len(self.stamps)
 
     def take(self, chosen: np.ndarray) -> "ImageTimes":
-        """Returns some of them, [k]."""
+        """Selects some of the images, [k]."""
         return ImageTimes(self.topic, self.stamps[chosen], self.times[chosen])
 
     def read(self, bag: AnyBag, index: int) -> Any:
-        """Returns the message of one image."""
+        """Reads the message of one image."""
         time = int(self.times[index])
         for stamped in bag.messages([self.topic], time, time + 1):
             if stamp_of(stamped.message, stamped.time) == self.stamps[index]:
@@ -71,7 +71,7 @@ class ImageTimes:
         raise FormatError(bag.path, f"an image on {self.topic} is not there any more")
 
     def name(self, bag: AnyBag, index: int) -> Path:
-        """Returns what an image is called in messages: the topic and its stamp [s]."""
+        """Names an image in messages: its topic and its stamp [s]."""
         seconds, rest = divmod(int(self.stamps[index]), 1_000_000_000)
         return bag.path / self.topic.lstrip("/") / f"{seconds}.{rest:09d}"
 
@@ -226,7 +226,7 @@ def _rgb(bag: AnyBag, images: ImageTimes, index: int, lens: Lens) -> np.ndarray:
 def _depth(
     bag: AnyBag, depths: ImageTimes, index: int, lens: Lens, camera: "_DepthCamera"
 ) -> np.ndarray:
-    """Returns z-depth [h, w] float32, registered where it is not."""
+    """Reads z-depth [h, w] float32, and registers it where it is not."""
     with naming(depths.name(bag, index)):
         depth = depth_of(depths.read(bag, index))
     if camera.elsewhere is None:
@@ -242,7 +242,7 @@ def _images_of(bag: AnyBag, name: str, found: list[tuple[int, int]]) -> ImageTim
 
 
 def _lens(bag: AnyBag, image: ImageTopic, named: str | None) -> Lens | None:
-    """Returns the lens of a topic's images; None where no camera_info belongs to it."""
+    """Finds the lens of a topic's images; None if no camera_info belongs to it."""
     name = find_info(bag, image, named)
     if name is None:
         return None
@@ -269,7 +269,7 @@ def _depth_camera(
     lens: Lens,
     named: str | None,
 ) -> _DepthCamera:
-    """Returns where the depth camera is: by tf, if the frames differ.
+    """Locates the depth camera by tf, if the frames differ.
 
     Raises:
         FormatError: elsewhere, and not to be registered here.

@@ -61,17 +61,17 @@ class AnyBag(Protocol):
     """Topics whose type cannot be parsed."""
 
     def topics(self, *types: str) -> list[str]:
-        """Returns names of the topics of these types, sorted."""
+        """Lists the topics of these types, sorted."""
         ...
 
     def messages(
         self, topics: Collection[str], start: int | None = None, stop: int | None = None
     ) -> Iterator[Stamped]:
-        """Returns messages of some topics, recorded from `start` until before `stop` [ns]."""
+        """Yields messages of some topics, recorded from `start` until before `stop` [ns]."""
         ...
 
     def first(self, topic: str) -> Any:
-        """Returns the first message of a topic."""
+        """Reads the first message of a topic."""
         ...
 
 
@@ -131,7 +131,7 @@ class Bag:
                 self.left_out.append(one.topic)
 
     def topics(self, *types: str) -> list[str]:
-        """Returns names of the topics of these types, sorted."""
+        """Lists the topics of these types, sorted."""
         return sorted(name for name, one in self.types.items() if one in types)
 
     def messages(
@@ -157,7 +157,7 @@ class Bag:
                 yield Stamped(connection.topic, time, message)
 
     def first(self, topic: str) -> Any:
-        """Returns the first message of a topic.
+        """Reads the first message of a topic.
 
         Raises:
             FormatError: the bag is damaged there, or promises messages that are not there.
@@ -243,7 +243,7 @@ class MessageTypes:
 
 
 def find_bag(path: Path) -> Path | None:
-    """Returns the bag that a path stands for: itself, or the only bag file in a folder."""
+    """Finds the bag at a path: the path itself, or the only bag file in a folder."""
     if path.is_file():
         return path if path.suffix.lower() in SUFFIXES else None
     if not path.is_dir():

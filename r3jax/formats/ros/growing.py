@@ -78,7 +78,7 @@ class GrowingFile:
         return os.fstat(self._file.fileno()).st_size
 
     def part(self, begin: int, end: int) -> bytes | None:
-        """Returns the bytes from `begin` to `end`; None where they have not all been written."""
+        """Reads the bytes from `begin` to `end`; None unless all of them have been written."""
         if end > self.size:
             return None
         found = os.pread(self._file.fileno(), end - begin, begin)
@@ -133,7 +133,7 @@ class McapFollower:
         return data
 
     def _record(self, operation: int, begin: int, end: int) -> list[Note]:
-        """Returns messages of one record of the file; takes note of schemas and channels."""
+        """Reads the messages of one record of the file; notes schemas and channels."""
         self._is_whole = operation in (_DATA_END, _FOOTER)  # the summary repeats what was there
         if operation == _MESSAGE:
             head = self._file.part(begin, min(end, begin + _MESSAGE_HEAD.size)) or b""
@@ -153,7 +153,7 @@ class McapFollower:
         return []
 
     def _chunk(self, begin: int) -> bytes:
-        """Returns the records of a chunk, unpacked; the last one is kept."""
+        """Unpacks the records of a chunk, and caches the last one."""
         if self._unpacked[0] != begin:
             head = self._file.part(begin - _HEAD.size, begin) or bytes(_HEAD.size)
             data = self._file.part(begin, begin + _HEAD.unpack(head)[1]) or b""
@@ -208,7 +208,7 @@ def _records(data: bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def _text(data: bytes, at: int) -> tuple[str, int]:
-    """Returns a text with its length before it, and where it ends."""
+    """Reads a text with its length before it, and returns where it ends."""
     (length,) = struct.unpack_from("<I", data, at)
     end = at + 4 + length
     if end > len(data):
@@ -276,7 +276,7 @@ class GrowingBag:
                         self.types[note.channel.topic] = note.channel.kind
 
     def topics(self, *types: str) -> list[str]:
-        """Returns names of the topics of these types, sorted."""
+        """Lists the topics of these types, sorted."""
         return sorted(name for name, one in self.types.items() if one in types)
 
     def messages(
@@ -289,14 +289,14 @@ class GrowingBag:
                 yield self._message(file, note)
 
     def fresh(self, topics: Collection[str]) -> Iterator[Stamped]:
-        """Yields messages of some topics that came in since this was last asked."""
+        """Yields messages of some topics that arrived since the last call."""
         first, self._fresh = self._fresh, len(self._notes)
         for file, note in self._notes[first:]:
             if note.channel.topic in topics:
                 yield self._message(file, note)
 
     def first(self, topic: str) -> Any:
-        """Returns the first message of a topic."""
+        """Reads the first message of a topic."""
         if topic not in self._by_topic:
             raise FormatError(self.path, f"there is no message on {topic}")
         return self._message(*self._notes[self._by_topic[topic][0]]).message
@@ -319,9 +319,9 @@ class GrowingBag:
 
 
 def growing_files(path: Path) -> list[Path]:
-    """Returns the files of a bag that may be being recorded, in their order; none.
+    """Lists the files of a bag that may still be recorded, in their order.
 
-    It is no such bag.
+    The list is empty if there is no such bag.
 
     Args:
         path: an MCAP, or a folder with its parts.
@@ -359,7 +359,7 @@ def _refuse(path: Path, found: list[Path]) -> None:
 
 
 def _numbered(path: Path) -> tuple[int, str]:
-    """Returns the order of drive_9.mcap and drive_10.mcap."""
+    """Returns a sort key by number: drive_10.mcap comes after drive_9.mcap."""
     number = re.search(r"_(\d{1,9})\.mcap$", path.name)
     return int(number[1]) if number else 0, path.name
 
@@ -379,7 +379,7 @@ class FollowedBag:
         self._reading: BagReading | None = None
 
     def images(self, files: list[Path]) -> PosedImages:
-        """Returns what is there by now.
+        """Reads the posed images that are certain by now.
 
         Args:
             files: of `growing_files`.
@@ -397,7 +397,7 @@ class FollowedBag:
 
 
 def key_frames(stamps: np.ndarray, poses: np.ndarray, until: int) -> np.ndarray:
-    """Returns frames half a second apart between which the camera has moved.
+    """Selects frames half a second apart between which the camera has moved.
 
     Args:
         stamps: [n] int64 [ns], ascending.

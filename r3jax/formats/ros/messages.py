@@ -72,19 +72,19 @@ _COMPRESSED_DEPTH_HEAD = struct.Struct("<iff")
 def stamp_of(message: Any, otherwise: int = 0) -> int:
     """Returns when a message was taken, by its header [ns].
 
-    `otherwise` where it is not filled in.
+    Without a stamp in the header it is `otherwise`.
     """
     stamp = message.header.stamp
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec) or otherwise
 
 
 def frame_of(message: Any) -> str:
-    """Returns the frame of a message's header; ROS 1 may begin it with a slash."""
+    """Returns the frame of a message's header, without the leading slash of ROS 1."""
     return str(message.header.frame_id).lstrip("/")
 
 
 def encoding_of(message: Any) -> str:
-    """Returns how the pixels of an image are stored, such as rgb8 or 16UC1."""
+    """Returns the encoding of an image's pixels, such as rgb8 or 16UC1."""
     if hasattr(message, "encoding"):
         return str(message.encoding)
     stored = str(message.format)
@@ -114,7 +114,7 @@ def is_gray(message: Any) -> bool:
 
 
 def rgb_of(message: Any) -> np.ndarray:
-    """Returns colors of an image, [H, W, 3] uint8.
+    """Converts an image to colors, [H, W, 3] uint8.
 
     Args:
         message: sensor_msgs/Image of 8-bit RGB, Bayer, YUV 4:2:2 or gray, or CompressedImage of
@@ -144,9 +144,9 @@ def rgb_of(message: Any) -> np.ndarray:
 
 
 def _levels(message: Any, encoding: str, channels: int) -> np.ndarray:
-    """Returns rows of 8 bits a value, [height, width * channels] uint8.
+    """Reads rows of 8 bits per value, [height, width * channels] uint8.
 
-    Of 16 bits the upper half.
+    Of values of 16 bits the upper byte is kept.
     """
     if "16" not in encoding:
         return _rows(message, np.dtype("u1"), channels)
@@ -169,9 +169,9 @@ def _from_bayer(raw: np.ndarray, channels: tuple[int, ...]) -> np.ndarray:
 
 
 def _tent(image: np.ndarray) -> np.ndarray:
-    """Returns the image [H, W] under the weights 1 2 1, up and down and to the sides.
+    """Filters an image [H, W] with the weights 1 2 1 along columns and rows.
 
-    Zero outside.
+    Pixels outside count as zero.
     """
     for axis in (0, 1):
         padded = np.pad(image, [(1, 1) if axis == one else (0, 0) for one in (0, 1)])
@@ -193,9 +193,9 @@ def _from_yuv(rows: np.ndarray, first: int) -> np.ndarray:
 
 
 def depth_of(message: Any) -> np.ndarray:
-    """Returns z-depth of an image, [h, w] float32 [m].
+    """Converts an image to z-depth, [h, w] float32 [m].
 
-    0 no measurement, inf beyond the sensor's range.
+    0 means no measurement, inf beyond the sensor's range.
 
     Args:
         message: sensor_msgs/Image of 16UC1 (millimeters) or 32FC1 (meters), or CompressedImage of
@@ -216,12 +216,12 @@ def depth_of(message: Any) -> np.ndarray:
 
 
 def clean_depth(depth: np.ndarray) -> np.ndarray:
-    """Returns the same as float32; NaN, negative numbers and -inf become 0: no measurement."""
+    """Converts depth to float32; NaN, negative numbers and -inf become 0: no measurement."""
     return np.where(depth > 0.0, depth, 0.0).astype(np.float32)  # NaN makes it false
 
 
 def _rows(message: Any, kind: np.dtype, channels: int) -> np.ndarray:
-    """Returns the rows of a plain image without what pads them, [height, width * channels]."""
+    """Reads the rows of a plain image without their padding, [height, width * channels]."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     used = width * channels * kind.itemsize
     if not 0 < width * height <= MAX_PIXELS:
@@ -237,7 +237,7 @@ def _rows(message: Any, kind: np.dtype, channels: int) -> np.ndarray:
 
 
 def _unpacked(data: bytes, stored: str, is_meters: bool) -> np.ndarray:
-    """Returns the depth from a PNG of 16 bits or RVL, with image_transport's header or without."""
+    """Decodes depth from a PNG of 16 bits or RVL, with image_transport's header or without."""
     inverse = None
     if "compressedDepth" in stored:
         if len(data) < _COMPRESSED_DEPTH_HEAD.size:
@@ -260,7 +260,7 @@ def _unpacked(data: bytes, stored: str, is_meters: bool) -> np.ndarray:
 
 
 def lens_of(info: Any, *, is_rectified: bool = False) -> Lens:
-    """Returns the lens of sensor_msgs/CameraInfo, where pixel centers lie at whole numbers.
+    """Converts sensor_msgs/CameraInfo, whose pixel centers lie at whole numbers, to a lens.
 
     Args:
         info: the message.
@@ -284,7 +284,7 @@ def lens_of(info: Any, *, is_rectified: bool = False) -> Lens:
 
 
 def rectified_lens(matrix: np.ndarray, size: tuple[int, int]) -> Lens:
-    """Returns the pinhole of a matrix [9] or [12] whose pixel centers lie at whole numbers.
+    """Makes the pinhole of a matrix [9] or [12] whose pixel centers lie at whole numbers.
 
     Args:
         matrix: K or P, row by row.
@@ -347,7 +347,7 @@ def unpack_rvl(data: bytes) -> np.ndarray:
 
 
 def _numbers(stream: bytes) -> np.ndarray:
-    """Returns all numbers of a stream, [k] int64."""
+    """Decodes all numbers of a stream, [k] int64."""
     words = np.frombuffer(stream[: len(stream) // 4 * 4], "<u4")
     nibbles = (words[:, None] >> np.arange(28, -1, -4, dtype=np.uint32)) & 15
     nibbles = nibbles.ravel().astype(np.int64)
@@ -362,7 +362,7 @@ def _numbers(stream: bytes) -> np.ndarray:
 
 
 def _runs(numbers: np.ndarray, total: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns differences of the pixels that are measured, and which pixels those are [total]."""
+    """Splits a stream into differences of the measured pixels, and a mask of these [total]."""
     is_measured = np.zeros(total, bool)
     deltas: list[np.ndarray] = []
     at, pixel = 0, 0

@@ -71,7 +71,7 @@ _NODES = (
 
 
 def is_rtabmap_database(path: Path) -> bool:
-    """Returns True if the file is a database with the tables of RTAB-Map."""
+    """Checks whether the file is a database with the tables of RTAB-Map."""
     if path.suffix.lower() != ".db" or not path.is_file():
         return False
     try:
@@ -161,15 +161,15 @@ def _reading(path: Path) -> Generator[None]:
 
 
 def _query(path: Path, sql: str, values: Sequence[Any] = ()) -> list[Any]:
-    """Returns all rows of a query; raises FormatError as `_reading`."""
+    """Reads all rows of a query; raises FormatError as `_reading`."""
     with _reading(path):
         return query_database(path, sql, values)
 
 
 def _optimized(path: Path) -> dict[int, np.ndarray] | None:
-    """Returns poses of the robot by the node's id, [4, 4].
+    """Reads the poses of the robot by the node's id, [4, 4].
 
-    None where the graph was never optimized.
+    None if the graph was never optimized.
     """
     columns = {row[1] for row in _query(path, "PRAGMA table_info(Admin)")}
     if not {"opt_ids", "opt_poses"} <= columns:
@@ -185,7 +185,7 @@ def _optimized(path: Path) -> dict[int, np.ndarray] | None:
 
 
 def _unzipped(blob: Any) -> bytes:
-    """Returns the bytes of a matrix that RTAB-Map compressed; its size and type follow them."""
+    """Unpacks the bytes of a matrix that RTAB-Map compressed, without its size and type."""
     if not isinstance(blob, bytes):
         raise ForeignFileError("the optimized poses are no bytes")
     try:
@@ -205,7 +205,7 @@ def _poses(data: bytes) -> np.ndarray:
 def _node(
     path: Path, row: tuple[Any, ...], optimized: dict[int, np.ndarray] | None
 ) -> _Node | None:
-    """Returns a node; None where it has no camera or no pose."""
+    """Reads a node; None if it has no camera or no pose."""
     number, pose, calibration = row
     is_known = isinstance(number, int) and isinstance(calibration, bytes)
     if not is_known or not isinstance(pose, bytes) or len(pose) != 48:
@@ -219,7 +219,7 @@ def _node(
 
 
 def _camera(path: Path, number: int, data: bytes) -> tuple[Lens, np.ndarray]:
-    """Returns a node's lens, and the camera on the robot."""
+    """Reads a node's lens, and the pose of the camera on the robot."""
     header = np.frombuffer(data[: 4 * _HEADER], "<i4").tolist()
     if len(header) < _HEADER or header[3] != 0:
         raise ForeignFileError(
@@ -258,7 +258,7 @@ def _rgb(path: Path, node: _Node) -> np.ndarray:
 
 
 def _depth(path: Path, node: _Node, *, has_confidence: bool) -> np.ndarray:
-    """Returns z-depth [h, w] float32, where the sensor was sure."""
+    """Reads z-depth [h, w] float32 where the sensor was confident."""
     with naming(path / "depth" / str(node.id)):
         depth = _all_depth(_blob(path, "depth", node))
         rows = _query(path, _CONFIDENCE, (node.id,)) if has_confidence else []
@@ -270,9 +270,9 @@ def _depth(path: Path, node: _Node, *, has_confidence: bool) -> np.ndarray:
 
 
 def _confidence(data: bytes) -> np.ndarray:
-    """Returns the confidence [h, w] uint8.
+    """Reads the confidence [h, w] uint8.
 
-    A PNG, or rows by zlib with their number, length and type behind.
+    It is a PNG, or rows packed by zlib and followed by their number, length and type.
     """
     if data.startswith(_PNG):
         wanted = "confidence must be an 8-bit PNG"
@@ -290,7 +290,7 @@ def _confidence(data: bytes) -> np.ndarray:
 
 
 def _all_depth(data: bytes) -> np.ndarray:
-    """Returns z-depth [h, w] float32 as it is stored."""
+    """Reads z-depth [h, w] float32 as it is stored."""
     if data.startswith(_RVL):
         return clean_depth(0.001 * unpack_rvl(data[len(_RVL) :]).astype(np.float64))
     wanted = "depth must be a PNG of 16 bits or of four channels"
@@ -313,7 +313,7 @@ def is_rtabmap_export(path: Path) -> bool:
 
 
 def _name(path: Path) -> str | None:
-    """Returns what the names of all files begin with."""
+    """Finds the prefix that the names of all files share."""
     found = [one.name.removesuffix(_POSES) for one in path.glob(f"*{_POSES}")]
     found = [name for name in found if (path / f"{name}_rgb").is_dir()]
     return found[0] if len(found) == 1 else None
@@ -346,7 +346,7 @@ def read_rtabmap_export(path: Path | str) -> PosedImages:
 
 
 def _shot(archive: Archive, source: Path, name: str, row: np.ndarray) -> Shot | None:
-    """Returns one frame of a row [9]; None where it has no image or camera."""
+    """Makes one frame of a row [9]; None if it has no image or camera."""
     number = int(row[8]) if np.isfinite(row[8]) and abs(row[8]) < 1e15 else -1
     image, calibration = f"{name}_rgb/{number}.jpg", f"{name}_calib/{number}.yaml"
     if not archive.has(image) or not archive.has(calibration):
@@ -364,7 +364,7 @@ def _shot(archive: Archive, source: Path, name: str, row: np.ndarray) -> Shot | 
 
 
 def _lens(text: str, size: tuple[int, int]) -> Lens:
-    """Returns the camera in a YAML of OpenCV, for an image of this width and height."""
+    """Reads the camera in a YAML of OpenCV, for an image of this width and height."""
     matrix = _matrix(text, "projection_matrix", 12)
     matrix = _matrix(text, "camera_matrix", 9) if matrix is None else matrix
     if matrix is None:
@@ -373,7 +373,7 @@ def _lens(text: str, size: tuple[int, int]) -> Lens:
 
 
 def _matrix(text: str, name: str, count: int) -> np.ndarray | None:
-    """Returns the numbers of a matrix; None where it is not there."""
+    """Reads the numbers of a matrix; None if it is missing."""
     found = re.search(rf"{name}:[^\[\]]{{0,200}}data:\s*\[([^\[\]]{{0,2000}})\]", text)
     if found is None:
         return None

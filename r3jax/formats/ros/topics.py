@@ -59,9 +59,9 @@ class ImageTopic:
 
 
 def find_images(bag: AnyBag, topics: Topics) -> tuple[ImageTopic, ImageTopic]:
-    """Returns the color and depth.
+    """Finds the topics of color and depth.
 
-    The named ones, else those that look most like a registered pair.
+    They are the named ones, else those that look most like a registered pair.
 
     Raises:
         FormatError: there is no color or no depth; says what there is and what to do.
@@ -96,7 +96,7 @@ def find_images(bag: AnyBag, topics: Topics) -> tuple[ImageTopic, ImageTopic]:
 
 
 def _likeness(color: ImageTopic, depth: ImageTopic) -> tuple[bool, ...]:
-    """Returns how likely two topics are the color and depth of one camera."""
+    """Rates how likely two topics are the color and depth of one camera."""
     has = lambda one, *words: any(word in one.name for word in words)
     is_packed = lambda one: one.name.endswith(_TRANSPORTS)
     return (
@@ -112,14 +112,14 @@ def _likeness(color: ImageTopic, depth: ImageTopic) -> tuple[bool, ...]:
 
 
 def _parent(topic: str) -> str:
-    """Returns the namespace of an image's topic, that its camera_info shares."""
+    """Returns the namespace of an image's topic, which its camera_info shares."""
     for suffix in _TRANSPORTS:
         topic = topic.removesuffix(suffix)
     return topic.rpartition("/")[0].lstrip("/")
 
 
 def find_info(bag: AnyBag, image: ImageTopic, named: str | None) -> str | None:
-    """Returns the topic of an image's camera: its sibling, else the only one of the same frame."""
+    """Finds the topic of an image's camera: its sibling, else the only one of its frame."""
     if named is not None:
         return named
     infos = bag.topics(CAMERA_INFO)
@@ -132,20 +132,20 @@ def find_info(bag: AnyBag, image: ImageTopic, named: str | None) -> str | None:
 
 
 def find_pose(bag: AnyBag) -> str | None:
-    """Returns the topic that most likely says where the robot is."""
+    """Finds the topic that is most likely the pose of the robot."""
     found = [name for kind in POSES for name in bag.topics(kind)]
     return found[0] if found else None
 
 
 def _listed(bag: AnyBag) -> str:
-    """Returns some topics and their types."""
+    """Lists some topics and their types, in words."""
     shown = [f"{name} ({kind.rpartition('/')[2]})" for name, kind in sorted(bag.types.items())]
     more = f" and {len(shown) - 12} more" if shown[12:] else ""
     return (", ".join(shown[:12])[:1000] or "nothing") + more + not_parsed(bag)
 
 
 def not_parsed(bag: AnyBag) -> str:
-    """Returns a part of a sentence on the topics that are left out."""
+    """Describes the topics that are left out, in part of a sentence."""
     if not bag.left_out:
         return ""
     more = f" and {len(bag.left_out) - 4} more" if bag.left_out[4:] else ""
@@ -234,13 +234,13 @@ def find_chain(
 
 
 def _known(tree: TransformTree) -> str:
-    """Returns a part of a sentence on the transforms that there are."""
+    """Describes the transforms that there are, in part of a sentence."""
     known = [f"{child} in {edge.parent}" for child, edge in sorted(tree.edges.items())]
     return f", tf only has {', '.join(known[:4])[:200]}" if known else ""
 
 
 def _pose_of(message: Any) -> tuple[Any, Any]:
-    """Returns the position and orientation of a message that holds one pose."""
+    """Reads the position and orientation of a message that holds one pose."""
     if hasattr(message, "transform"):
         return message.transform.translation, message.transform.rotation
     pose = message.pose

@@ -105,9 +105,9 @@ class TransformTree:
         edge.rotations.append(xyzw)
 
     def chain(self, frame: str, world: str | None = None) -> list[str]:
-        """Returns frames from `frame` up to the world, both with it.
+        """Lists the frames from `frame` up to the world, both included.
 
-        Up to the root where none is named.
+        If no world is named, it leads up to the root.
 
         Returns:
             What there is of it: it ends elsewhere where no transform leads on.
@@ -125,7 +125,7 @@ class TransformTree:
         return any(self.edges[frame].times for frame in chain[:-1])
 
     def is_moving(self, chain: list[str]) -> bool:
-        """Returns True if these samples differ; ROS 1 repeats what never moves all the time."""
+        """Returns True if these samples differ: ROS 1 also repeats fixed transforms."""
         edges = [self.edges[frame] for frame in chain[:-1]]
         samples = [part for edge in edges for part in (edge.positions, edge.rotations)]
         return any(np.ptp(np.stack(part), axis=0).max() > _STILL for part in samples)
@@ -133,7 +133,7 @@ class TransformTree:
     def latest(self, chain: list[str]) -> int:
         """Returns the time up to which all edges of a chain have samples [ns].
 
-        Later poses may yet change.
+        Later poses may still change.
         """
         times = [max(self.edges[frame].times) for frame in chain[:-1] if self.edges[frame].times]
         return min(times, default=0)

@@ -59,7 +59,7 @@ def read_replica_slam(path: Path | str) -> PosedImages:
 
 
 def _numbered(folder: Path, start: str) -> dict[str, Path]:
-    """Returns the images whose names start like this, by what follows."""
+    """Finds the images whose names start like this, by the rest of their names."""
     if not folder.is_dir():
         raise FormatError(folder, "the folder is missing")
     kinds = (".png", ".jpg", ".jpeg")
@@ -70,7 +70,7 @@ def _numbered(folder: Path, start: str) -> dict[str, Path]:
 
 
 def _camera(path: Path) -> tuple[Lens, DepthUnit]:
-    """Returns the camera of all images, and the unit of their depth."""
+    """Reads the camera of all images, and the unit of their depth."""
     places = (path / "cam_params.json", path.resolve().parent / "cam_params.json")
     source = next((place for place in places if place.exists()), places[0])
     with naming(source):

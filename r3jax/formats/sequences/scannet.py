@@ -75,7 +75,7 @@ def read_scannet(path: Path | str) -> PosedImages:
 
 
 def _pose(source: Path) -> np.ndarray | None:
-    """Returns a camera-to-world matrix [4, 4]; None where tracking was lost."""
+    """Reads a camera-to-world matrix [4, 4]; None where tracking was lost."""
     pose = read_matrix(source, 4, 4)
     return mend_pose(source, "the pose", pose) if np.all(np.isfinite(pose)) else None
 
@@ -91,7 +91,7 @@ def _lens(source: Path, images: Sequence[Path]) -> Lens:
 
 
 def _number(path: Path) -> tuple[int, str]:
-    """Returns the order by the number in a name: 10 comes after 9."""
+    """Returns a sort key by the number in a name: 10 comes after 9."""
     is_number = path.stem.isascii() and path.stem.isdigit() and len(path.stem) < 19
     return (int(path.stem) if is_number else 1 << 62), path.name
 
@@ -122,7 +122,7 @@ class _Head(NamedTuple):
 
 
 def is_sens(path: Path) -> bool:
-    """Returns True if it is named like a .sens file, or is a folder with one."""
+    """Checks whether the path is named like a .sens file, or is a folder with one."""
     return _file(path) is not None
 
 
@@ -216,7 +216,7 @@ def _counted(count: int, size: int) -> int:
 
 
 def _frame(file: BinaryIO, size: int) -> tuple[np.ndarray, _Place]:
-    """Returns a pose, and where the pixels lie; they are not read."""
+    """Reads a pose, and locates the pixels without reading them."""
     *pose, _, _, color_bytes, depth_bytes = _FRAME.unpack(_take(file, _FRAME.size))
     at = file.tell()
     if at + color_bytes + depth_bytes > size:
@@ -238,7 +238,7 @@ def _rgb(path: Path, head: _Head, place: _Place) -> np.ndarray:
 
 
 def _depth(path: Path, head: _Head, place: _Place) -> np.ndarray:
-    """Returns z-depth [h, w] float32."""
+    """Reads z-depth [h, w] float32."""
     shape = (head.depth_lens.height, head.depth_lens.width)
     wanted = 2 * shape[0] * shape[1]
     with naming(path):

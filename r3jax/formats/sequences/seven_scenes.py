@@ -33,7 +33,7 @@ def is_seven_scenes(path: Path) -> bool:
 
 
 def _colors(path: Path) -> dict[str, Path]:
-    """Returns the color images by the names of their frames."""
+    """Finds the color images by the names of their frames."""
     found = [p for p in path.glob("frame-*.color.*") if p.suffix.lower() in _SUFFIXES]
     found.sort(key=lambda image: _SUFFIXES.index(image.suffix.lower()))
     return {image.name.removesuffix(f".color{image.suffix}"): image for image in found}

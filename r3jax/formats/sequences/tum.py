@@ -88,7 +88,7 @@ def read_tum(path: Path | str) -> PosedImages:
 
 
 def _pictures(folder: Path, name: str) -> tuple[np.ndarray, list[Path]]:
-    """Returns times [n] and paths of a list of images."""
+    """Reads times [n] and paths of a list of images."""
     source = folder / name
     times: list[float] = []
     paths: list[Path] = []
@@ -108,7 +108,7 @@ def _pictures(folder: Path, name: str) -> tuple[np.ndarray, list[Path]]:
 
 
 def _pose(source: Path, row: np.ndarray) -> np.ndarray:
-    """Returns `T_world_camera` of a line: time, translation, quaternion x y z w."""
+    """Converts a line (time, translation, quaternion x y z w) to `T_world_camera`."""
     return quaternion_pose(source, f"the pose at {row[0]:.4f} s", row[1:4], row[4:])
 
 

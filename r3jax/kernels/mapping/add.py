@@ -38,14 +38,14 @@ def _mix(h):
 
 @inlined
 def _hash(low, high):
-    """Returns `table.hash_key`."""
+    """Computes `table.hash_key`."""
     h = _mix(np.uint32(low ^ np.uint32(0x9E3779B9)))
     return _mix(np.uint32(h ^ np.uint32(high * np.uint32(0x85EBCA6B))))
 
 
 @inlined
 def _slot(hashed, probe, capacity):
-    """Returns `table._slot`."""
+    """Computes `table._slot`."""
     return np.int64(
         np.uint32(hashed + np.uint32(probe * (probe + 1) // 2)) & np.uint32(capacity - 1)
     )

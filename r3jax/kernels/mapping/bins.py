@@ -66,9 +66,9 @@ def _cosine(x, y, z, bin, lattice):
 
 @inlined_fused
 def nearest_bin(x, y, z, cell, table, lattice):
-    """Returns the bin of a direction (`geometry.sphere.nearest_bin`).
+    """Finds the bin of a direction (`geometry.sphere.nearest_bin`).
 
-    The best of the few in its cell.
+    It is the best of the few candidates in the direction's cell.
     """
     cell, width = np.uint32(cell), table.shape[1]
     # The first two are compared without a branch: most cells have one or two, unpredictably.
@@ -86,7 +86,7 @@ def nearest_bin(x, y, z, cell, table, lattice):
 
 @inlined
 def center_of_words(low, high, voxel_size):
-    """Returns the center [m] of the voxel whose key has these words (`geometry.voxels.unpack`)."""
+    """Computes the center [m] of the voxel whose key has these words (`geometry.voxels.unpack`)."""
     return (
         (signed_of(low) + _HALF) * voxel_size,
         (signed_of(middle_of(low, high)) + _HALF) * voxel_size,
@@ -96,7 +96,7 @@ def center_of_words(low, high, voxel_size):
 
 @inlined
 def center_of(key, row, voxel_size):
-    """Returns the center of the voxel in a row of the map [m]."""
+    """Computes the center of the voxel in a row of the map [m]."""
     return center_of_words(key[0, row], key[1, row], voxel_size)
 
 
@@ -147,6 +147,6 @@ def mark_rows(key, visited, resolution, rows, num, camera, table, lattice):
 
 @inlined
 def is_sound(camera):
-    """Returns False for a camera or a voxel size that cannot be: nothing is seen then."""
+    """Checks a camera and a voxel size: nothing is seen with invalid ones."""
     total = camera.voxel_size + camera.focal + camera.x + camera.y + camera.z
     return (camera.voxel_size > _ZERO) & (abs(total) < _INFINITE)

@@ -61,7 +61,7 @@ def _sort3(a, b, c):
 
 @inlined_fused
 def _or(value, other):
-    """Returns a depth, and another where it is no measurement."""
+    """Returns a depth, or the other one if the first is no measurement."""
     return value if value > _ZERO else other
 
 

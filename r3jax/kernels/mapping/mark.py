@@ -32,16 +32,16 @@ _ZERO, _ONE, _NEAREST = np.float32(0.0), np.float32(1.0), np.float32(1e-3)
 
 @inlined_fused
 def _along(T, axis, center):
-    """Returns one coordinate of a point in the camera's frame."""
+    """Computes one coordinate of a point in the camera's frame."""
     along = T[axis, 0] * center[0] + T[axis, 1] * center[1]
     return along + T[axis, 2] * center[2] + T[axis, 3]
 
 
 @inlined_fused
 def _farthest_around(depth, row, column):
-    """Returns the largest depth of a pixel and its neighbors.
+    """Finds the largest depth of a pixel and its neighbors.
 
-    On a slope it changes within a pixel.
+    On a slope the depth changes within a pixel.
     """
     farthest = _ZERO
     for i in range(max(row - 1, 0), min(row + 2, depth.shape[0])):
@@ -82,7 +82,7 @@ def _project(key, first, num, frame, voxel_size, pixels, depths):
 
 @inlined_fused
 def _is_shown(pixel, measured, z, depth, slack, is_visible):
-    """Returns whether a frame shows a row that lies in one of its pixels."""
+    """Checks whether a frame shows a row that lies in one of its pixels."""
     if measured == _ZERO:
         return is_visible  # a hole
     if not measured > _ZERO:
@@ -97,7 +97,7 @@ def _is_shown(pixel, measured, z, depth, slack, is_visible):
 
 @inlined
 def _is_camera(frame, camera):
-    """Returns False for intrinsics or a pose that cannot be."""
+    """Checks that the intrinsics and the pose are valid."""
     total = frame.fx + frame.fy + frame.cx + frame.cy
     for axis in range(3):
         for k in range(4):

@@ -23,7 +23,7 @@ _PACKAGE = Path(__file__).parents[2]
 
 
 def cache_folder() -> Path:
-    """Returns where this package keeps what would take long to make again."""
+    """Returns the folder where this package caches results that take long to compute."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "r3jax"
 
 
@@ -55,7 +55,7 @@ def compile_ahead(cache: Path | None = None) -> None:
 
 
 def _note_in(cache: Path) -> Path:
-    """Returns the file that is there once all kernels of these sources were compiled."""
+    """Returns the file whose existence marks that all kernels of these sources were compiled."""
     sources = sorted(_PACKAGE.glob("kernels/**/*.py"))
     parts = [f"{path} {path.stat().st_mtime_ns}" for path in sources]
     parts += [version("numba"), version("jaxlib"), platform.python_version(), platform.node()]

@@ -88,7 +88,7 @@ _low_bits_to_exponent = _of_float(_emit_shift_exponent)
 
 @intrinsic
 def whole(typingctx, value):
-    """Returns a whole number as an int32; Numba's own conversion goes by way of int64."""
+    """Converts a whole number in a float to int32; Numba's own conversion goes through int64."""
 
     def codegen(context, builder, sig, args):
         return builder.fptosi(args[0], _INT)
@@ -98,9 +98,9 @@ def whole(typingctx, value):
 
 @intrinsic
 def middle_of(typingctx, word, other):
-    """Returns the middle bits of two words.
+    """Extracts the middle bits of two words.
 
-    Bits 21 to 31 of the first, then 0 to 9 of the second.
+    They are bits 21 to 31 of the first, then 0 to 9 of the second.
     """
 
     def codegen(context, builder, sig, args):
@@ -120,7 +120,7 @@ def end_of(typingctx, word):
 
 @intrinsic
 def signed_of(typingctx, word):
-    """Returns the lowest 21 bits of a word as a number from -2^20 on, in a float."""
+    """Converts the lowest 21 bits of a word to a number from -2^20 on, in a float."""
 
     def codegen(context, builder, sig, args):
         bits = builder.and_(args[0], _int((1 << 21) - 1))
@@ -130,13 +130,13 @@ def signed_of(typingctx, word):
 
 
 def _biased(builder, index):
-    """Returns a whole number from -2^20 on, in a float, as 21 bits; inverse of `signed_of`."""
+    """Converts a whole number from -2^20 on, in a float, to 21 bits; inverse of `signed_of`."""
     return builder.add(builder.fptosi(index, _INT), _int(1 << 20))
 
 
 @intrinsic
 def low_word(typingctx, x, y):
-    """Returns the low word of a packed key (`geometry.voxels.pack`), of whole numbers in floats."""
+    """Packs the low word of a key (`geometry.voxels.pack`) from whole numbers in floats."""
 
     def codegen(context, builder, sig, args):
         x, y = _biased(builder, args[0]), _biased(builder, args[1])
@@ -147,7 +147,7 @@ def low_word(typingctx, x, y):
 
 @intrinsic
 def high_word(typingctx, y, z):
-    """Returns the high word of a packed key, of whole numbers in floats."""
+    """Packs the high word of a key from whole numbers in floats."""
 
     def codegen(context, builder, sig, args):
         y, z = _biased(builder, args[0]), _biased(builder, args[1])
@@ -168,7 +168,7 @@ def fused(typingctx, a, b, c):
 
 @intrinsic
 def count_bits(typingctx, word):
-    """Returns how many bits of a word of 32 are set."""
+    """Counts the set bits of a word of 32."""
 
     def codegen(context, builder, sig, args):
         return builder.zext(builder.ctpop(args[0]), ir.IntType(64))
@@ -184,7 +184,7 @@ def bits_of(typingctx, value):
 
 @intrinsic
 def float_of(typingctx, word):
-    """Returns the float of which a word of 32 holds the bits."""
+    """Returns the float whose bits are a word of 32."""
 
     def codegen(context, builder, sig, args):
         return builder.bitcast(args[0], _FLOAT)
@@ -194,7 +194,7 @@ def float_of(typingctx, word):
 
 @intrinsic
 def _add_bits(typingctx, value, other):
-    """Returns the float whose bits are the sum of two floats' bits."""
+    """Adds the bits of two floats, as integers, and returns the float with these bits."""
 
     def codegen(context, builder, sig, args):
         return builder.bitcast(
@@ -206,9 +206,9 @@ def _add_bits(typingctx, value, other):
 
 @intrinsic
 def key_of(typingctx, distance, row):
-    """Returns an int64 that sorts by distance >= 0 first, then by row.
+    """Packs an int64 that sorts by distance >= 0 first, then by row.
 
-    What is nearest has the least.
+    The nearest item has the least key.
     """
     long = ir.IntType(64)
 
@@ -221,7 +221,7 @@ def key_of(typingctx, distance, row):
 
 @intrinsic
 def distance_of(typingctx, key):
-    """Returns the distance in a key."""
+    """Extracts the distance from a key."""
     long = ir.IntType(64)
 
     def codegen(context, builder, sig, args):
@@ -240,7 +240,7 @@ _E4, _E5 = np.float32(9.675541892647743e-3), np.float32(1.3276472454890609e-3)
 
 @inlined_fused
 def exp2(power):
-    """Returns 2^power to 2e-7, and 2^-126 for all powers below.
+    """Computes 2^power to 2e-7, and 2^-126 for all powers below.
 
     2^n p(f) with n the nearest integer and p of degree 5 (as in `kernels.splatting.lanes`).
     """
@@ -258,7 +258,7 @@ _L5, _L7 = np.float32(0.5770780163555854), np.float32(0.41219858311113244)
 
 @inlined_fused
 def log2(x):
-    """Returns log2 x to 1e-6, for normal x > 0.
+    """Computes log2 x to 1e-6, for normal x > 0.
 
     The series of the inverse hyperbolic tangent: log m = 2 artanh((m - 1) / (m + 1)), with the
     mantissa m in [sqrt(1/2), sqrt(2)).

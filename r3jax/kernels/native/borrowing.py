@@ -65,7 +65,7 @@ class _BorrowArguments(FunctionPass):
 
 
 def _borrow(statement: Any, scope: Any) -> list[Any]:
-    """Returns the assignment of an argument in three steps."""
+    """Rewrites the assignment of an argument in three steps."""
     loc = statement.loc
     given, function = scope.redefine("$given", loc), scope.redefine("$borrowed", loc)
     return [
@@ -79,7 +79,7 @@ class Borrowing(CompilerBase):
     """Numba's own compiler with the pass above."""
 
     def define_pipelines(self) -> list[Any]:
-        """Returns all passes, in order."""
+        """Defines all passes, in order."""
         manager = DefaultPassBuilder.define_nopython_pipeline(self.state)
         manager.add_pass_after(_BorrowArguments, IRProcessing)
         manager.finalize()

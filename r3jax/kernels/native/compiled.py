@@ -120,7 +120,7 @@ def inlined_fast(function: _Function) -> _Function:
 
 
 def inlined_fused(function: _Function) -> _Function:
-    """Returns the same where LLVM may do no more than fuse a product with a sum."""
+    """Compiles like `inlined`, but lets LLVM fuse a product with a sum, and nothing else."""
     compiler = njit(error_model="numpy", **_BARE, forceinline=True, fastmath={"contract"})
     return _compiled_by(compiler, function)
 
@@ -135,7 +135,7 @@ def parallel_kernel(function: _Function) -> _Function:
 
 @intrinsic
 def claim(typingctx: Any, counter: Any) -> Any:
-    """Returns the next number of a counter (an int64 array of length 1) that all threads share."""
+    """Takes the next number of a counter (an int64 array of length 1) that all threads share."""
     signature = types.int64(counter)
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:

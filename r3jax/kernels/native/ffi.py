@@ -85,9 +85,9 @@ def _write_int32(typingctx, address, value):
 
 @inlined
 def answers_metadata(frame):
-    """Returns XLA asks first which version of the interface a handler speaks.
+    """Answers XLA's first call, which requests the version of the interface.
 
-    True if this is that call.
+    Returns True if this is that call.
 
     The major version is ours; within it all fields that are read lie where they were (`structs`),
     so any minor one, that is, the caller's, will do.
@@ -103,7 +103,7 @@ def answers_metadata(frame):
 
 @inlined
 def _buffer(frame, kind, index):
-    """Returns address of the index-th argument or result of a call."""
+    """Returns the address of the index-th argument or result of a call."""
     return _int64_at(_int64_at(frame + kind) + 8 * index)
 
 
@@ -120,14 +120,14 @@ def float0(frame, kind, index):
 
 @inlined
 def floats1(frame, kind, index):
-    """Returns views the index-th argument or result as float32 with one axis."""
+    """Views the index-th argument or result as float32 with one axis."""
     buffer = _buffer(frame, kind, index)
     return carray(_floats(_int64_at(buffer + _DATA)), (_length(buffer, 0),))
 
 
 @inlined
 def floats_flat(frame, kind, index):
-    """Returns views the index-th argument or result, of any shape, as float32 with one axis."""
+    """Views the index-th argument or result, of any shape, as float32 with one axis."""
     buffer = _buffer(frame, kind, index)
     size = 1
     for axis in range(_int64_at(buffer + _RANK)):
@@ -137,7 +137,7 @@ def floats_flat(frame, kind, index):
 
 @inlined
 def floats2(frame, kind, index):
-    """Returns views the index-th argument or result as float32 with two axes."""
+    """Views the index-th argument or result as float32 with two axes."""
     buffer = _buffer(frame, kind, index)
     shape = _length(buffer, 0), _length(buffer, 1)
     return carray(_floats(_int64_at(buffer + _DATA)), shape)
@@ -145,7 +145,7 @@ def floats2(frame, kind, index):
 
 @inlined
 def floats3(frame, kind, index):
-    """Returns views the index-th argument or result as float32 with three axes."""
+    """Views the index-th argument or result as float32 with three axes."""
     buffer = _buffer(frame, kind, index)
     shape = _length(buffer, 0), _length(buffer, 1), _length(buffer, 2)
     return carray(_floats(_int64_at(buffer + _DATA)), shape)
@@ -153,14 +153,14 @@ def floats3(frame, kind, index):
 
 @inlined
 def ints1(frame, kind, index):
-    """Returns views the index-th argument or result as int32 with one axis."""
+    """Views the index-th argument or result as int32 with one axis."""
     buffer = _buffer(frame, kind, index)
     return carray(_ints(_int64_at(buffer + _DATA)), (_length(buffer, 0),))
 
 
 @inlined
 def bytes2(frame, kind, index):
-    """Returns views the index-th argument or result as uint8 with two axes."""
+    """Views the index-th argument or result as uint8 with two axes."""
     buffer = _buffer(frame, kind, index)
     shape = _length(buffer, 0), _length(buffer, 1)
     return carray(_bytes(_int64_at(buffer + _DATA)), shape)
@@ -168,7 +168,7 @@ def bytes2(frame, kind, index):
 
 @inlined
 def ints2(frame, kind, index):
-    """Returns views the index-th argument or result as int32 with two axes."""
+    """Views the index-th argument or result as int32 with two axes."""
     buffer = _buffer(frame, kind, index)
     shape = _length(buffer, 0), _length(buffer, 1)
     return carray(_ints(_int64_at(buffer + _DATA)), shape)
@@ -176,7 +176,7 @@ def ints2(frame, kind, index):
 
 @inlined
 def words2(frame, kind, index):
-    """Returns views the index-th argument or result as uint32 with two axes."""
+    """Views the index-th argument or result as uint32 with two axes."""
     buffer = _buffer(frame, kind, index)
     shape = _length(buffer, 0), _length(buffer, 1)
     return carray(_words(_int64_at(buffer + _DATA)), shape)
@@ -184,7 +184,7 @@ def words2(frame, kind, index):
 
 @inlined
 def bytes1(frame, kind, index):
-    """Returns views the index-th argument or result as uint8 with one axis."""
+    """Views the index-th argument or result as uint8 with one axis."""
     buffer = _buffer(frame, kind, index)
     return carray(_bytes(_int64_at(buffer + _DATA)), (_length(buffer, 0),))
 
@@ -221,7 +221,7 @@ def _start_threads() -> str:
 
 
 def num_workers() -> int:
-    """Returns threads that share the work: one for each core that the process may use."""
+    """Returns the number of threads: one for each core that the process may use."""
     return min(get_num_threads(), num_cores())
 
 

@@ -59,7 +59,7 @@ class _Library(JITCodeLibrary):
         self._final_module.link_in(module, preserve=True)
 
     def _get_module_for_linking(self) -> Any:
-        """Returns the function and all that it calls, for what Numba compiles in its own way."""
+        """Links a function with all that it calls, for what Numba compiles in its own way."""
         module = super()._get_module_for_linking().clone()
         # Callers first: LLVM leaves out functions that have no caller yet.
         for library in reversed(self._apart):

@@ -16,7 +16,7 @@ from r3jax.kernels.native.structs import misread
 
 
 def by_platform(*, cpu: Callable[..., Any], default: Callable[..., Any]) -> Callable[..., Any]:
-    """Returns a function that is `cpu` where a program runs on a CPU, and `default` elsewhere.
+    """Makes a function that is `cpu` where a program runs on a CPU, and `default` elsewhere.
 
     Args:
         cpu: calls kernels. Not used if this jaxlib's FFI version is unsupported.
@@ -42,7 +42,7 @@ def call_of_many(
     item: Any,
     num_rows: int,
 ) -> Any:
-    """Returns `formula(shared, item)`, such that `vmap` over items is one call of a kernel on CPUs.
+    """Computes `formula(shared, item)`, so that its `vmap` is one kernel call on CPUs.
 
     Elsewhere it is the formula in batches, whose memory does not grow with the number of items.
     Where what is shared differs as well, one call follows the other.
@@ -66,7 +66,7 @@ def call_of_many(
 
 
 def _over_items(score: Callable[[Any, Any], Any], shared: Any, items: Any) -> Any:
-    """Returns `score(shared, items)`, so that `vmap` over items is one call of all of them."""
+    """Computes `score(shared, items)`, so that `vmap` over items is one call of all of them."""
     # Jitted, so that its constants stay inside: a branch under `vmap` would batch them, too.
     batched = custom_vmap(jax.jit(score))
 
@@ -105,7 +105,7 @@ def is_cpu_only() -> bool:
 
 
 def can_call_kernels() -> bool:
-    """Returns whether kernels run here; warns once if they do not, or only one after the other."""
+    """Checks whether kernels run here; warns once if they do not, or only in turn."""
     problem = missing_for_kernels()
     if problem and jax.default_backend() == "cpu":
         _warn(

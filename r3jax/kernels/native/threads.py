@@ -172,7 +172,7 @@ class _Threads:
 
 
 def _load(builder: Any, array: Any, index: Any) -> Any:
-    """Returns an element of an array of words at an address."""
+    """Loads an element of an array of words at an address."""
     first = builder.inttoptr(array, _LONG.as_pointer())
     index = ir.Constant(_LONG, index) if isinstance(index, int) else index
     return builder.load(builder.gep(first, [index]))

@@ -43,7 +43,7 @@ def segment_cells(a, b):
 
 @compiled_or_plain
 def segments_are_inside(mask, a, b):
-    """Returns finds which segments from one point to others run through cells of a mask only.
+    """Finds which segments from one point to others run through cells of a mask only.
 
     Args:
         mask: [X, Y, Z] bool; beyond the array nothing is in the mask.

@@ -27,7 +27,7 @@ _Kernel = Callable[..., None]
 def shortest_paths(
     usable: Bool[np.ndarray, "X Y Z"], start: tuple[int, int, int] | None
 ) -> tuple[Float[np.ndarray, "X Y Z"], Int[np.ndarray, "X Y Z"]]:
-    """Returns the length of the shortest way to each cell, and the cell before it.
+    """Finds the length of the shortest path to each cell, and the cell before it.
 
     Args:
         usable: cells that paths may cross.
@@ -61,7 +61,7 @@ def _steps(
     Int[np.ndarray, "26 6"],
     Int[np.ndarray, " 26"],
 ]:
-    """Returns the 26 steps in a flattened grid: offsets, lengths, offsets of the cells between."""
+    """Lists the 26 steps in a flattened grid: offsets, lengths, offsets of the cells between."""
     strides = np.array([shape[1] * shape[2], shape[2], 1])
     steps = [d for d in itertools.product((-1, 0, 1), repeat=3) if d != (0, 0, 0)]
     between = np.zeros((len(steps), _LONGEST), dtype=np.int64)

@@ -44,7 +44,7 @@ def _shown_rows(before, after):
 
 @inlined
 def _find_set(items, bits, chosen):
-    """Returns writes where the items stand whose bit is set; returns how many they are."""
+    """Writes the indices of the items whose bit is set, and returns their number."""
     num = 0
     for i in range(items.shape[0]):
         item = np.int64(items[i])

@@ -83,7 +83,7 @@ def _draw(view, layout, voxel_size, runs, centers, numbers, placed, targets, key
 
 @inlined_fused
 def _value_of(row, view, rows, forms, lattice, bits):
-    """Returns R of the voxel in a row of the map, as a view sees it."""
+    """Computes R of the voxel in a row of the map, as a view sees it."""
     x, y, z = center_of(rows.key, row, rows.voxel_size)
     dx, dy, dz = view.position[0] - x, view.position[1] - y, view.position[2] - z
     distance = max(math.sqrt(dx * dx + dy * dy + dz * dz), _LEAST)
@@ -100,9 +100,9 @@ def _value_of(row, view, rows, forms, lattice, bits):
 
 @kernel
 def _mean_of(keys, layout, view, rows, forms, lattice, bits):
-    """Returns the mean of R over the pixels.
+    """Computes the mean of R over the pixels.
 
-    0 where a pixel shows nothing. Neighbors often show the same.
+    Empty pixels count as 0. Neighbors often show the same voxel.
     """
     total, last, value = 0.0, np.int64(-1), np.float32(0.0)
     side = side_of((layout.height, layout.width))

@@ -42,7 +42,7 @@ class Terms(NamedTuple):
 
 @inlined_fused
 def _score(rows, row, position, focal, forms, lattice, bits):
-    """Returns the terms of one row, but for R."""
+    """Computes the terms of one row, except for R."""
     x, y, z = center_of(rows.key, row, rows.voxel_size)
     dx, dy, dz = position[0] - x, position[1] - y, position[2] - z
     distance = max(math.sqrt(dx * dx + dy * dy + dz * dz), _LEAST)

@@ -127,7 +127,7 @@ class Buffer(NamedTuple):
 
 @kernel
 def new_scratch():
-    """Returns the room for a chunk."""
+    """Allocates scratch memory for a chunk."""
     return Scratch(
         np.empty(PLACED, np.float32), np.empty(TARGETS, np.int32), np.empty(CHUNK, np.int32),
         np.empty(CHUNK + 1, np.int32), np.empty(ANGLES, np.float32), np.zeros(CHUNK, np.int32),
@@ -322,7 +322,7 @@ def unexplored_of(cells):
 
 @kernel
 def _sorted_cells(cells):
-    """Returns bricks of the unexplored cells."""
+    """Sorts the unexplored cells into bricks."""
     found = unexplored_of(cells)
     order, bricks = sorted_points(found.centers)
     empty = Empty(np.empty_like(found.centers), np.empty_like(found.numbers))
@@ -335,7 +335,7 @@ def _sorted_cells(cells):
 
 @kernel
 def _near_cells(cells, views, is_sound, layout, voxel_size):
-    """Returns the unexplored cells that few views may show, in their order, in one brick."""
+    """Gathers the unexplored cells that some of a few views may show, in order, in one brick."""
     num = cells.unexplored.shape[0]
     empty = Empty(np.empty((3, num), np.float32), np.empty(num, np.int32))
     is_near, chosen, to = np.empty(CHUNK, np.int32), np.empty(CHUNK + 1, np.int32), 0

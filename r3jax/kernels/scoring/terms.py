@@ -58,13 +58,13 @@ NEARLY_ONE = np.float32(0.999)
 
 @inlined
 def log2_or_never(x):
-    """Returns log2 x; `NEVER` where x is 0."""
+    """Computes log2 x; `NEVER` where x is 0."""
     return log2(x) if x > _ZERO else NEVER
 
 
 @inlined
 def consistency(count, m2, is_pairwise):
-    """Returns the delta of a voxel, in [0, 1] (`scoring.terms.consistency`)."""
+    """Computes delta of a voxel, in [0, 1] (`scoring.terms.consistency`)."""
     variance = m2 / max(count - _ONE, _ONE)
     spread = _TWO * variance if is_pairwise else math.sqrt(_TWO_THIRDS_OF_TWO * variance)
     return min(max(_ONE - spread, _ZERO), _ONE) if count > _ONE else _ONE
@@ -72,7 +72,7 @@ def consistency(count, m2, is_pairwise):
 
 @intrinsic
 def lowest_bit(typingctx, word):
-    """Returns the number of the lowest bit that is set in a word that is not 0."""
+    """Finds the lowest bit that is set in a word that is not 0."""
 
     def codegen(context, builder, sig, args):
         number = builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
@@ -130,26 +130,26 @@ def look_from(visited, at, lattice, direction):
 
 @inlined_fused
 def bias_of(cosine, is_one):
-    """Returns the b = cos^kappa, with kappa 1 or 2."""
+    """Computes B = cos^kappa, with kappa 1 or 2."""
     return cosine if is_one else cosine * cosine
 
 
 @inlined_fused
 def log_noise(bias, is_one, log_delta):
-    """Returns log2 of delta^(kappa (1 - b))."""
+    """Computes log2 of delta^(kappa (1 - b))."""
     kappa = _ONE if is_one else _TWO
     return kappa * (_ONE - bias) * log_delta
 
 
 @inlined_fused
 def log_resolution(bias, delta, best, distance, focal):
-    """Returns log2 of min(1, rho_max / rho)^(1 - delta b), with rho = focal / distance."""
+    """Computes log2 of min(1, rho_max / rho)^(1 - delta b), with rho = focal / distance."""
     return (_ONE - delta * bias) * log2_or_never(min(best * distance / focal, _ONE))
 
 
 @inlined_fused
 def product_of_terms(cosine, is_one, distance, delta, log_delta, best, focal):
-    """Returns R of one voxel from its angle and what is known of it; one power instead of two."""
+    """Computes R of a voxel from its angle and its observations, by one power instead of two."""
     bias = bias_of(cosine, is_one)
     power = log_noise(bias, is_one, log_delta) + log_resolution(bias, delta, best, distance, focal)
     return bias * exp2(power)

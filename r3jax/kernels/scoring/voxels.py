@@ -46,7 +46,7 @@ _CLASSES = 8
 
 @inlined
 def bins_of(words, word, row):
-    """Returns two words of 32 bins as one of 64; the second may not be there."""
+    """Joins two words of 32 bins to one of 64; the second may be missing."""
     bits = np.uint64(words[word, row])
     if word + 1 < words.shape[0]:
         bits |= np.uint64(words[word + 1, row]) << np.uint64(32)
@@ -55,7 +55,7 @@ def bins_of(words, word, row):
 
 @inlined
 def _num_directions(record, words):
-    """Returns how many bins a voxel was seen from."""
+    """Counts the bins from which a voxel was seen."""
     num = np.int64(0)
     for word in range(words):
         num += count_bits(record[_WORDS + word])
@@ -100,7 +100,7 @@ def empty_voxels(num, num_words):
 
 @kernel
 def sorted_voxels(rows, views, is_sound, forms, workers):
-    """Returns bricks of the voxels that some view may see, and what is known of them."""
+    """Sorts the voxels that some view may see into bricks, with their observations."""
     slots, bricks = sorted_slots(rows, views, is_sound, workers)
     voxels = empty_voxels(bricks.starts[bricks.starts.shape[0] - 1], rows.visited.shape[0])
     _gather(slots, bricks, rows, forms, workers, voxels)
@@ -146,9 +146,9 @@ def _gather(slots, bricks, rows, forms, workers, voxels):
 
 @kernel
 def near_voxels(rows, views, is_sound, layout, forms, workers):
-    """Returns the same of few views, in the order of the map.
+    """Gathers the voxels that some of a few views may see, in the order of the map.
 
-    A brick for each thread's share of it.
+    There is one brick for each thread's share of the map.
     """
     capacity = rows.counts.shape[0]
     voxels = empty_voxels(capacity, rows.visited.shape[0])

@@ -42,7 +42,7 @@ def pixel_range(low, high, size):
 
 @inlined
 def tile_columns(record, width):
-    """Returns the first and last column of tiles that the ellipse touches."""
+    """Finds the first and last column of tiles that the ellipse touches."""
     reach = np.sqrt(record[TWO_S] / record[INVERSE_XX]) + _SLACK
     first, last = pixel_range(record[CENTER_X] - reach, record[CENTER_X] + reach, width)
     if last < first:
@@ -52,7 +52,7 @@ def tile_columns(record, width):
 
 @inlined
 def rows_in_column(record, column, height):
-    """Returns the first and last pixel row that the ellipse touches within one column of tiles.
+    """Finds the first and last pixel row that the ellipse touches in one column of tiles.
 
     On the ellipse, dy = slope dx +- sqrt(variance (2 s - dx^2 / xx)) (the Gaussian's conditional
     mean and variance). Its highest point in a strip is that of the whole ellipse, or lies on the
@@ -78,7 +78,7 @@ _RADIX = 11  # bits a pass; three passes sort the 31 bits of a positive float
 
 @inlined
 def _tiles_of(record, width, height):
-    """Returns the number of tiles that a Gaussian touches."""
+    """Counts the tiles that a Gaussian touches."""
     first, last = tile_columns(record, width)
     count = 0
     for column in range(first, last + 1):
@@ -180,7 +180,7 @@ def emit_all(size, workers, records, counts, drawn, tiles, rows):
 
 @kernel
 def order_of(keys):
-    """Returns the stable order of the keys: a radix sort, least significant digits first."""
+    """Sorts the keys stably by radix sort, least significant digits first; returns the order."""
     n, buckets = keys.shape[0], 1 << _RADIX
     places = np.zeros((3, buckets), np.int32)
     for i in range(n):

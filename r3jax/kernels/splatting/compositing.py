@@ -68,7 +68,7 @@ def alpha_in_row(record, dx, across, slant, dy):
 
 @inlined
 def in_tile(record, left, top, lanes):
-    """Returns what a Gaussian's alpha in a tile takes: dx, A dx^2, B dx, and its center's row."""
+    """Computes the terms of a Gaussian's alpha in a tile: dx, A dx^2, B dx, its center's row."""
     dx = (record[at.CENTER_X] - (np.float32(left) + _HALF)) - lanes
     y = record[at.CENTER_Y] - (np.float32(top) + _HALF)
     return dx, record[at.A] * dx * dx, record[at.B] * dx, y
@@ -100,7 +100,7 @@ def _blend_row(k, alpha, color, depth, state):
 
 @inlined
 def tile_is_finished(state):
-    """Returns whether no pixel lets any light through."""
+    """Checks whether no pixel transmits any light."""
     most = load(state, 0)
     for k in range(TILE, PIXELS, TILE):
         most = larger(most, load(state, k))

@@ -42,7 +42,7 @@ def basis_at(x, y, z, count, basis):
 
 @inlined_fast
 def gradient_by_direction(x, y, z, count, g):
-    """Returns the gradient by (x, y, z), seen as three free variables, of sum(g[k] basis[k])."""
+    """Computes the gradient by (x, y, z), as free variables, of sum(g[k] basis[k])."""
     dx = dy = dz = np.float32(0.0)
     if count > 1:
         dx, dy, dz = -_C1 * g[3], -_C1 * g[1], _C1 * g[2]

@@ -44,7 +44,7 @@ def _constant(value):
 
 
 def _vector(context, builder, value, ty):
-    """Returns the value itself, or a scalar in every lane."""
+    """Returns a vector as it is, and a scalar in every lane."""
     if isinstance(ty, Lanes):
         return value
     scalar = context.cast(builder, value, ty, types.float32)
@@ -57,7 +57,7 @@ def _vector(context, builder, value, ty):
 
 
 def _code(emit):
-    """Returns the code generator of a function of vectors or scalars that gives a vector."""
+    """Makes the code generator of a function of vectors or scalars whose result is a vector."""
 
     def codegen(context, builder, sig, args):
         vectors = [_vector(context, builder, a, t) for a, t in zip(args, sig.args, strict=True)]
@@ -145,7 +145,7 @@ _overload_operator(operator.mul, _mul)
 
 @intrinsic
 def splat(typingctx, value):
-    """Returns a scalar in every lane."""
+    """Puts a scalar in every lane."""
     return LANES(value), _code(lambda builder, a: a)
 
 
@@ -164,7 +164,7 @@ def _address(context, builder, sig, args, element):
 
 @intrinsic
 def load(typingctx, array, index):
-    """Returns 16 floats of a flat float32 array from `index` on."""
+    """Loads 16 floats of a flat float32 array from `index` on."""
 
     def codegen(context, builder, sig, args):
         return builder.load(_address(context, builder, sig, args, _VECTOR), align=4)
@@ -205,7 +205,7 @@ def store12(typingctx, array, index, value):
 
 @intrinsic
 def any_above(typingctx, vector, threshold):
-    """Returns whether any lane is above a scalar."""
+    """Checks whether any lane is above a scalar."""
 
     def codegen(context, builder, sig, args):
         level = _vector(context, builder, args[1], sig.args[1])
@@ -235,7 +235,7 @@ _fold8, _fold4, _fold2, _fold1 = (_binary(_fold(group)) for group in (8, 4, 2, 1
 
 @inlined
 def sums_of_10(a, b, c, d, e, f, g, h, i, j):
-    """Returns sums over the lanes of ten vectors: lane k of the result is the sum of vector k.
+    """Sums each of ten vectors over its lanes: lane k of the result is the sum of vector k.
 
     A tree of 11 additions for all of them together, in one fixed order.
     """
@@ -248,7 +248,7 @@ def sums_of_10(a, b, c, d, e, f, g, h, i, j):
 
 @intrinsic
 def _times_power_of_two(typingctx, value, shifted):
-    """Returns the value 2^n, where n stands in the low bits of the float `shifted`."""
+    """Computes value 2^n, where n is in the low bits of the float `shifted`."""
 
     def codegen(context, builder, sig, args):
         bits = builder.bitcast(args[1], _INTEGERS)
@@ -264,7 +264,7 @@ _ROUND = 12582912.0  # 1.5 * 2^23: adding it leaves the rounded integer in the l
 
 @inlined
 def exp2(power):
-    """Returns 2^power to 1e-7, for powers of at least -126.
+    """Computes 2^power to 1e-7, for powers of at least -126.
 
     2^n p(f) with n the nearest integer and p of degree 5, the best on [-1/2, 1/2] (fitted by
     Lawson's reweighted least squares).

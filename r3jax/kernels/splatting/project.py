@@ -22,7 +22,7 @@ _TWO_S_SCALE, _TWO_S_MORE = np.float32(2.002), np.float32(1e-4)
 
 @inlined_fast
 def in_camera(mean, view):
-    """Returns coordinates of a center in the camera's frame [m]."""
+    """Computes the coordinates of a center in the camera's frame [m]."""
     x = view[0] * mean[0] + view[1] * mean[1] + view[2] * mean[2] + view[9]
     y = view[3] * mean[0] + view[4] * mean[1] + view[5] * mean[2] + view[10]
     z = view[6] * mean[0] + view[7] * mean[1] + view[8] * mean[2] + view[11]
@@ -31,7 +31,7 @@ def in_camera(mean, view):
 
 @inlined_fast
 def clamped_slope(ratio, focal, middle, size):
-    """Returns x/z where the Jacobian is taken: at most 30 % of half the image outside it."""
+    """Computes x/z where the Jacobian is taken: at most 30 % of half the image outside it."""
     margin = MARGIN * np.float32(size)
     low, high = -(middle + margin) / focal, (np.float32(size) - middle + margin) / focal
     return min(max(ratio, low), high)
@@ -82,7 +82,7 @@ def image_axes(rows, rotation, log_scales, axes):
 
 @inlined_fast
 def covariance_of(axes):
-    """Returns xx, xy, yy of the dilated covariance in the image [px^2]."""
+    """Computes xx, xy, yy of the dilated covariance in the image [px^2]."""
     xx = axes[0] * axes[0] + axes[1] * axes[1] + axes[2] * axes[2] + DILATION
     xy = axes[0] * axes[3] + axes[1] * axes[4] + axes[2] * axes[5]
     yy = axes[3] * axes[3] + axes[4] * axes[4] + axes[5] * axes[5] + DILATION
@@ -91,13 +91,13 @@ def covariance_of(axes):
 
 @inlined_fast
 def sigmoid(logit):
-    """Returns 1 / (1 + exp(-logit))."""
+    """Computes 1 / (1 + exp(-logit))."""
     return ONE / (ONE + np.exp(-logit))
 
 
 @inlined_fast
 def _are_finite(mean, quat, log_scales):
-    """Returns whether all parameters are numbers."""
+    """Checks whether all parameters are finite."""
     total = quat[3]
     for i in range(3):
         total += abs(mean[i]) + abs(quat[i]) + abs(log_scales[i])
@@ -106,7 +106,7 @@ def _are_finite(mean, quat, log_scales):
 
 @inlined_fast
 def _is_outside(center, row, two_s, log_scales, size):
-    """Returns whether not even a ball of the Gaussian's largest scale would reach the image.
+    """Checks whether even a ball of the Gaussian's largest scale would miss the image.
 
     Most of what is out of sight needs no covariance, then.
     """

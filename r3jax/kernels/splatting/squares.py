@@ -159,7 +159,7 @@ def squares_of_all(lists, records, images, background, workers, slots):
 
 @inlined
 def _quadratic(columns, sums, parameter, first, last):
-    """Returns a^T M a for one parameter, a being its row of A; rounding takes none below 0."""
+    """Computes a^T M a for one parameter, a being its row of A; clamps it to 0 from below."""
     total = _ZERO
     for k in range(first, last):
         inner = _HALF * sums[_PLACES[k][k]] * columns[k, parameter]

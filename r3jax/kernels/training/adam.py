@@ -27,9 +27,9 @@ _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 
 @inlined
 def _patterns(rates, num_harmonics, num_open):
-    """Returns the learning rates and shares of the gradient [5, p].
+    """Repeats the learning rates and shares of the gradient to [5, p].
 
-    P floats are whole vectors and rows.
+    A run of p floats consists of whole vectors and of whole rows of harmonics.
 
     Args:
         rates: of the five arrays, and of the harmonics above the constant one [6].
@@ -80,9 +80,9 @@ def _steps(first, last, x, g, m, v, rate, share, corrections):
 
 @kernel
 def _squares(first, last, x, g):
-    """Returns the sum of the squares of a range of numbers and their gradients.
+    """Sums the squares of a range of numbers and their gradients.
 
-    Infinite if it overflows.
+    The sum is infinite if it overflows.
     """
     total, whole = splat(_ZERO), first + (last - first) // 16 * 16
     for k in range(first, whole, 16):
@@ -99,9 +99,9 @@ def _squares(first, last, x, g):
 
 @inlined
 def _chunk(number, arrays):
-    """Returns which array the chunk of a number is of, and its range.
+    """Finds the array and the range of the chunk of a number.
 
-    A kind beyond all behind the last.
+    The kind of a number after the last chunk is `KINDS`.
     """
     kind = 0
     while kind < KINDS:

@@ -50,7 +50,7 @@ _ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 
 @inlined
 def _padded(length):
-    """Returns floats of a row with its borders, whole vectors."""
+    """Computes the floats of a row with its borders, in whole vectors."""
     return BORDER + -(-length // 16) * 16 + BORDER
 
 
@@ -92,7 +92,7 @@ def _blur_slopes(slopes, y, blurred):
 
 @inlined
 def _down(ring, order, which, k):
-    """Returns the window down a ring of rows, whose places from top to bottom are given."""
+    """Applies the window down a ring of rows, whose places from top to bottom are given."""
     total = splat(_ZERO)
     for tap in range(_WIDTH):
         total = fma(load(ring[order[tap], which], k), _TAPS[tap], total)
@@ -108,7 +108,7 @@ def _set_order(y, order):
 
 @inlined
 def _sum_of(vector, room):
-    """Returns the sum over the lanes, first to last."""
+    """Sums the lanes, first to last."""
     store(room, 0, vector)
     total = 0.0
     for lane in range(16):

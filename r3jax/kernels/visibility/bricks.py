@@ -55,9 +55,9 @@ def _clipped(value):
 
 @kernel
 def box_of(views, is_sound, voxel_size):
-    """Returns indices of the voxels that bound what the views may see.
+    """Finds the box of voxel indices that the views may see, [2, 3].
 
-    [2, 3], the upper ones included.
+    The upper indices are included.
     """
     box = np.empty((2, 3), np.int64)
     box[0], box[1] = _LIMIT, -_LIMIT
@@ -73,7 +73,7 @@ def box_of(views, is_sound, voxel_size):
 
 @inlined
 def _brick_of(key, row, box, shift, dims):
-    """Returns the number of a row's brick; -1 outside the box."""
+    """Finds the brick of a row; -1 outside the box."""
     x, y, z = voxel_of(key, row)
     is_in = (x >= box[0, 0]) & (x <= box[1, 0]) & (y >= box[0, 1]) & (y <= box[1, 1])
     is_in = is_in & (z >= box[0, 2]) & (z <= box[1, 2])
@@ -110,7 +110,7 @@ def count_rows(key, count, box, shift, dims, bricks, counts):
 
 @kernel
 def begin_bricks(counts, starts, bricks):
-    """Returns where bricks begin, and where each share of the rows writes.
+    """Computes where bricks begin, and where each share of the rows writes.
 
     Empty bricks are left out.
 
@@ -214,7 +214,7 @@ def divide_points(points):
 
 @kernel
 def are_finite(numbers):
-    """Returns whether all of some numbers [a, b] are finite."""
+    """Checks whether all numbers [a, b] are finite."""
     found = True
     for i in range(numbers.shape[0]):
         for j in range(numbers.shape[1]):
@@ -263,7 +263,7 @@ def sorted_points(points):
 
 @inlined
 def bounds_of(view, layout):
-    """Returns the range of a view [m] and the planes that bound it, as `may_see` takes them.
+    """Computes the range of a view [m] and the planes that bound it, as `may_see` takes them.
 
     Each plane by its slope, `along = slope z`, and by how far along a margin reaches.
     """

@@ -45,7 +45,7 @@ def _extend(padded, begin, step, count, across, width):
 
 @inlined_fused
 def _flatter(before, after, step):
-    """Returns the change per pixel on the flatter side; 0 where the sides disagree."""
+    """Computes the change per pixel on the flatter side; 0 where the sides disagree."""
     least = min(abs(before), abs(after)) / step
     return least if before * after > _ZERO else _ZERO
 
@@ -64,7 +64,7 @@ def _steepest_down(lines, stride, slopes):
 
 @inlined_fused
 def _steepest_right(line, c):
-    """Returns the slope along the row at one column; the line begins `MARGIN` before the first."""
+    """Finds the slope along the row at one column; the line begins `MARGIN` before the first."""
     here, found = line[MARGIN + c], _ZERO
     for step in constants.STRIDES:
         before, after = here - line[MARGIN + c - step], line[MARGIN + c + step] - here
@@ -120,5 +120,5 @@ def surface_limit(distance, side, shape, pixel_angle, allowance, padded, slopes,
 
 @inlined_fused
 def padded_size(shape):
-    """Returns floats that `surface_limit` needs as scratch."""
+    """Returns how many floats `surface_limit` needs as scratch."""
     return (shape[0] + 2 * MARGIN) * (shape[1] + 2 * MARGIN)

@@ -49,11 +49,10 @@ def compact(marks, count, chosen):
 
 @kernel
 def bricks_of_shares(begins, ends, num):
-    """Returns bricks of arrays that shares have filled from `begins` to `ends`.
+    """Makes a brick of each range, `begins` to `ends`, that a share has filled.
 
-    Any view may see them.
-
-    Between two of them there is one of what is not filled, which no view sees.
+    Any view may see these bricks. After each of them there is one of the rows that its share did
+    not fill, which no view sees.
     """
     num_bricks = 2 * begins.shape[0]
     starts, spheres = np.empty(num_bricks + 1, np.int64), np.zeros((num_bricks, 4), np.float32)

@@ -16,7 +16,7 @@ RING = 2
 
 @inlined
 def side_of(shape):
-    """Returns the least power of two that holds an image."""
+    """Computes the least power of two that holds an image."""
     side = 1
     while side < max(shape[0], shape[1]):
         side *= 2
@@ -25,7 +25,7 @@ def side_of(shape):
 
 @inlined
 def num_levels(side):
-    """Returns levels of a pyramid, down to a single pixel."""
+    """Counts the levels of a pyramid, down to a single pixel."""
     levels = 1
     while side > 1:
         side, levels = side >> 1, levels + 1
@@ -40,28 +40,28 @@ def stride_of(side):
 
 @inlined
 def begin_of(level, side):
-    """Returns the place of the first pixel of a level; with floats as well."""
+    """Computes the place of the first pixel of a level; works with floats, too."""
     rows = 2 * (side - (side >> level)) + 2 * RING * level
     return (rows + RING) * stride_of(side) + RING
 
 
 @inlined
 def picture_size(side):
-    """Returns places of the finest level."""
+    """Returns the number of places in the finest level."""
     return stride_of(side) * stride_of(side)
 
 
 @inlined
 def pyramid_size(side):
-    """Returns places of all levels."""
+    """Returns the number of places in all levels."""
     return (2 * side + 2 * RING * num_levels(side)) * stride_of(side)
 
 
 @inlined
 def shape_of(shape, level):
-    """Returns the height and width of a level.
+    """Computes the height and width of a level.
 
-    Rounded up, so that every finer pixel has a parent.
+    Both are rounded up, so that every finer pixel has a parent.
     """
     above = (1 << level) - 1
     return (shape[0] + above) >> level, (shape[1] + above) >> level
@@ -86,7 +86,7 @@ def stands_for(row, column, shape, wraps):
 
 @inlined
 def _ring_pixel(i, shape):
-    """Returns the row and column of the i-th pixel one step outside of an image."""
+    """Computes the row and column of the i-th pixel one step outside of an image."""
     height, width = shape
     if i < 2 * (width + 2):
         return (height if i & 1 else -1), (i >> 1) - 1

@@ -25,9 +25,9 @@ _ZERO, _ONE, _INFINITE = np.float32(0.0), np.float32(1.0), np.float32(np.inf)
 
 @inlined_fused
 def _pixel_at(column, row, begin, stride, height, width):
-    """Returns the place of the pixel at continuous coordinates; far outside, or no number.
+    """Finds the place of the pixel at continuous coordinates.
 
-    In the ring.
+    Coordinates far outside, and those that are not numbers, lead into the ring.
     """
     c = column if column > -_ONE else -_ONE
     r = row if row > -_ONE else -_ONE

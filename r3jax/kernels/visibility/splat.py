@@ -37,9 +37,9 @@ _ONE, _TWO, _LEAST = np.float32(1.0), np.float32(2.0), np.float32(1e-6)
 
 @inlined_fused
 def _first_of(middle, edge):
-    """Returns the first of the two pixels round a coordinate; far outside, or no number.
+    """Finds the first of the two pixels round a coordinate.
 
-    In the ring.
+    A coordinate far outside, or one that is not a number, leads into the ring.
     """
     low = middle - _HALF
     low = low if low > -_RING else -_RING
@@ -48,9 +48,9 @@ def _first_of(middle, edge):
 
 @inlined_fused
 def _covers(down, right, reach, slants):
-    """Returns whether a voxel covers a pixel center so far from its own.
+    """Checks whether a voxel covers a pixel center at this offset from its own.
 
-    The octagon round the cube.
+    Its image is taken as the octagon round the cube.
 
     A far voxel may reach no center at all, and shows in its own pixel still.
     """

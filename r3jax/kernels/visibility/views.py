@@ -62,7 +62,7 @@ def view_at(views, i):
 
 @kernel
 def sound_views(views, voxel_size):
-    """Returns False for views with anything that is not finite, which see nothing."""
+    """Marks the views whose numbers are all finite; the others see nothing."""
     is_sound = np.empty(views.focal.shape[0], np.bool_)
     is_size = voxel_size > _ZERO and voxel_size < _INFINITE
     for i in range(is_sound.shape[0]):
