@@ -17,11 +17,10 @@ from typing import Annotated, Literal
 import tyro
 
 from experiments.pages.artifacts import markdown_table
-from experiments.pages.sweep_page import Sweep, write_page
+from experiments.pages.sweep_page import Trial, write_page
 from experiments.settings import known_settings, with_settings
 from experiments.suite import Options as SuiteOptions
 from experiments.suite import origin, request_of, run_cells
-from experiments.sweep_choice import Trial
 from experiments.sweep_space import (
     Axis,
     Point,
@@ -125,10 +124,10 @@ def main(options: Options) -> Path | None:
     trials = [
         Trial(point, last_records(root, own)) for point, own in zip(points, cells, strict=True)
     ]
-    sweep = Sweep(options.policy, tuple(axis.setting for axis in axes), tuple(trials))
+    settings = [axis.setting for axis in axes]
     folder = options.out / NAME / folder_name(options, axes)
     records = [record for trial in trials for record in trial.records]
-    write_page(folder, sweep, REPORTED, origin(f"experiments.{NAME}", records))
+    write_page(folder, settings, trials, REPORTED, origin(f"experiments.{NAME}", records))
     print(f"results  {folder}")
     return folder
 

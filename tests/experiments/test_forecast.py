@@ -53,7 +53,7 @@ def test_an_interval_knows_nothing_of_its_own_scene(known):
 
 
 def test_the_page_and_the_calibration(known, tmp_path):
-    write_page(tmp_path, known, [])
+    write_page(tmp_path, known)
     found = read_calibration(tmp_path / "calibration.json")
     assert found == known.calibration()
     page = (tmp_path / "forecast.md").read_text()

@@ -3,12 +3,11 @@
 import csv
 import json
 
-import numba
 import numpy as np
 import pytest
 from PIL import Image
 
-from experiments import planner_latency, planner_memory, planner_runs, planner_work
+from experiments import planner_latency, planner_memory, planner_runs
 from experiments.pages.artifacts import Origin, markdown_table, write_csv
 from experiments.planner_runs import Options, Size, bucket_of, fly, size_of
 
@@ -178,21 +177,3 @@ def test_another_commit_or_setting_is_flown_anew(tiny, monkeypatch):
     planner_runs.fly_all(options)
     assert [flight.commit == "another" for flight in flown] == [False, True]
     assert fly is not planner_runs.fly
-
-
-def test_decisions_are_timed_against_their_work(monkeypatch, tmp_path):
-    size = planner_work.Size((1, 2), (4, 8), 32, 1)
-    monkeypatch.setitem(planner_work.SIZES, "smoke", size)
-    threads = (numba.get_num_threads(),)
-    folder = planner_work.main(planner_work.Options("smoke", threads, tmp_path))
-    lines = (folder / "decisions.csv").read_text().splitlines()
-    rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
-    assert [(int(row["views"]), int(row["candidates"])) for row in rows] == [
-        (1, 4), (1, 8), (2, 4), (2, 8),
-    ]  # fmt: skip
-    for row in rows:
-        assert float(row["decision_ms"]) > float(row["scoring_ms"]) > 0.0
-        assert int(row["voxels"]) >= int(row["in_range"]) > 0
-    assert int(rows[2]["voxels"]) > int(rows[0]["voxels"])
-    with Image.open(folder / "work.png") as picture:
-        assert picture.width > 500
