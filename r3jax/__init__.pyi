@@ -1,9 +1,9 @@
-from .apps.forecast.difficulty import voxel_difficulty
 from .apps.forecast.expected_error import (
     ErrorImages,
     ExpectedError,
     expected_error,
     expected_error_images,
+    voxel_difficulty,
 )
 from .apps.forecast.forecast import is_done
 from .evaluation.evaluate import Evaluation, evaluate

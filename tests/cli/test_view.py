@@ -119,11 +119,11 @@ def test_pictures_are_written_without_viser_and_the_run_stays_as_it_is(
 
 def test_a_page_is_shown_until_it_is_interrupted(path, capsys, monkeypatch):
     pytest.importorskip("viser", reason="the viewer needs viser, which is not installed")
-    from r3jax.cli.commands import view
+    from r3jax.cli.commands import runs
 
-    monkeypatch.setattr(view.time, "sleep", lambda _: os.kill(os.getpid(), signal.SIGINT))
+    monkeypatch.setattr(runs.time, "sleep", lambda _: os.kill(os.getpid(), signal.SIGINT))
     codes = []
-    monkeypatch.setattr(view, "end_process", codes.append)
+    monkeypatch.setattr(runs, "end_process", codes.append)
     main(["view", str(path), "--port", "0"])
     assert codes == [0]
     shown = capsys.readouterr()

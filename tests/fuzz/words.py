@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from r3jax.apps.report import revisits
-from r3jax.cli.commands import audit, benchmark, explore, replay, train
+from r3jax.apps.report import figures
+from r3jax.cli.commands import audit, benchmark, explore, models, runs
 from r3jax.cli.main import main
 from r3jax.evaluation import judge
 from r3jax.exploration.config import ExplorationConfig
@@ -187,13 +187,13 @@ def with_work_left_out() -> None:
 
     audit.audit = begin
     explore.explore = begin
-    train.train.fit = begin
+    models.train.fit = begin
     judge.evaluate = begin
     benchmark.make_plan = begin
     merge.rebuild = begin
-    replay.differences = begin
+    runs.differences = begin
     judge.map_of = begin
-    revisits.follow_recording = begin
+    figures.follow_recording = begin
 
 
 VALUES = {

@@ -4,7 +4,7 @@ They fly at the same time. Every member has its own lens, policy, map and missio
 whose clock is behind steps next, so a mission lasts as long as its longest clock. At a meeting
 all learn the frames that were taken until then; in between each has its own frames on top. When
 it decides, it takes the views that the others were heading for at the last meeting as taken,
-and leaves to them what lies nearer to them (`apps.team.reserved_views`).
+and leaves to them what lies nearer to them (`ReservedViews`).
 
 No frame is known before it is taken: it is shared from then on, and a member receives it
 at the first meeting after that. Members that decide at the same time decide in turn.
@@ -15,16 +15,18 @@ log-odds. Frames in the order of the clock do: two members that received the sam
 same map, bit for bit.
 """
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from r3jax.apps.team.reserved_views import PromisedView, ReservedViews
 from r3jax.errors import InputError
 from r3jax.exploration.clock import make_clock, timed
 from r3jax.exploration.config import Budget, ExplorationConfig, parse_budget
@@ -34,14 +36,105 @@ from r3jax.exploration.state import LoopState, Mission, RecordingStopped, Stop, 
 from r3jax.exploration.step import relive, start_state, step
 from r3jax.exploration.taken_views import StepRow
 from r3jax.frame import Frame
-from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.geometry.cameras import Camera
+from r3jax.mapping.occupancy import OccupancyGrid, frontier_unexplored, squared_distance
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.planning.planner import add_frame, tell_policy
-from r3jax.planning.policy import LivesOutside, Policy
+from r3jax.planning.policy import Decision, LivesOutside, PlanInfo, Policy
 from r3jax.runs.reader import Run
 from r3jax.runs.writer import RunWriter
 from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.simulated import imagine_view
 from r3jax.simulators.base import Simulator
+
+
+@dataclass(frozen=True)
+class PromisedView:
+    """A view that one robot has decided to take, and that is not taken yet."""
+
+    camera: Camera
+
+    T_world_camera: np.ndarray
+    """Its pose, [4, 4]."""
+
+
+@dataclass
+class ReservedViews:
+    """Decides as another policy does, on what will be known once the promised views are taken."""
+
+    policy: Policy
+    """The robot that decides."""
+
+    promised: tuple[PromisedView, ...]
+
+    scoring: ScoringConfig
+    """How far the promised views see."""
+
+    def __post_init__(self) -> None:
+        """Goes by the name of the policy, and by its settings."""
+        # Others ask a policy for them, `motion_of` for one: they get what the inner one plans with.
+        self.name, self.config = self.policy.name, getattr(self.policy, "config", None)
+
+    def init(self, camera: Camera, grid: OccupancyGrid, *, key: Array) -> Any:
+        """As the policy does."""
+        return self.policy.init(camera, grid, key=key)
+
+    def observe(self, state: Any, map_state: MapState, frame: Frame) -> Any:
+        """As the policy does."""
+        return self.policy.observe(state, map_state, frame)
+
+    def decide(
+        self,
+        state: Any,
+        map_state: MapState,
+        grid: OccupancyGrid,
+        T_world_camera: np.ndarray,
+        *,
+        key: Array,
+    ) -> tuple[Decision | None, Any, PlanInfo]:
+        """Returns the view that the policy would take if the promised ones had been taken."""
+        # One after the other: what the first promises to show, the second cannot promise again.
+        for view in self.promised:
+            pose = jnp.asarray(view.T_world_camera, dtype=jnp.float32)
+            map_state, grid = imagine_view(map_state, grid, view.camera, pose, self.scoring)
+        others = jnp.asarray([view.T_world_camera[:3, 3] for view in self.promised], jnp.float32)
+        here = jnp.asarray(T_world_camera[:3, 3], dtype=jnp.float32)
+        # After the promises, so that "nothing left" counts what they leave.
+        grid = without_yielded(grid, here, others)
+        return self.policy.decide(state, map_state, grid, T_world_camera, key=key)
+
+    def follow(
+        self,
+        state: Any,
+        map_state: MapState,
+        grid: OccupancyGrid,
+        T_world_camera: np.ndarray,
+        waypoints: np.ndarray,
+    ) -> Any:
+        """As the policy does."""
+        return self.policy.follow(state, map_state, grid, T_world_camera, waypoints)
+
+
+@jax.jit
+def without_yielded(
+    grid: OccupancyGrid, here: Float[Array, " 3"], others: Float[Array, "K 3"]
+) -> OccupancyGrid:
+    """Returns the grid for a decision that leaves to others what lies nearer to them.
+
+    Cells that are nearer to one of the others than to here do not count, unless that would leave
+    nothing to explore.
+
+    Args:
+        grid: the coarse grid.
+        here: where the camera is [m].
+        others: where the others go [m].
+    """
+    # Two arrays at a time, never [K, X, Y, Z]; and squares order as distances do, without roots.
+    nearest = functools.reduce(jnp.minimum, [squared_distance(grid, other) for other in others])
+    is_yielded = nearest < squared_distance(grid, here)
+    # Only frontier cells matter: no robot can explore cells that border on no free cell.
+    is_left = jnp.any(frontier_unexplored(grid.ignoring(is_yielded)))
+    return grid.ignoring(is_yielded & is_left)
 
 
 @dataclass(frozen=True)

@@ -107,7 +107,7 @@ def _show_run(console: Console, path: Path) -> None:
 
 
 def _show_recording(console: Console, options: InfoOptions, path: Path) -> None:
-    from r3jax.apps.report.revisits import FrameReport, follow_recording, revisit_figure
+    from r3jax.apps.report.figures import FrameReport, follow_recording, revisit_figure
     from r3jax.plots.style import PNG_MARK, to_png
 
     if options.plot is not None:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import r3jax
-from r3jax.apps.forecast import difficulty
+from r3jax.apps.forecast import expected_error as difficulty
 from r3jax.geometry.voxels import unpack
 from tests.strategies import VOXEL_SIZE, Sighting, sightings
 

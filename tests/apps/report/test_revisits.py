@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
-from r3jax.apps.report.revisits import follow_recording, revisit_figure
+from r3jax.apps.report.figures import follow_recording, revisit_figure
 from r3jax.formats.recordings import read_recording
 from r3jax.plots.style import to_png
 

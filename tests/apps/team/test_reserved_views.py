@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from r3jax.apps.team.reserved_views import PromisedView, ReservedViews, without_yielded
+from r3jax.apps.team.team import PromisedView, ReservedViews, without_yielded
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.planning.policy import DecisionOutcome, PlanInfo
 from r3jax.scoring.simulated import imagine_view, simulate_view

@@ -15,8 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from r3jax.apps.team import team as real_team
-from r3jax.apps.team.reserved_views import without_yielded
-from r3jax.apps.team.team import Member, explore_team
+from r3jax.apps.team.team import Member, explore_team, without_yielded
 from r3jax.exploration import explore
 from r3jax.exploration.guard import OracleReadError
 from r3jax.exploration.state import StopReason
