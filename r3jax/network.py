@@ -10,7 +10,7 @@ LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 
 def exposure_warning(host: str, what: str = "sees the page") -> str | None:
-    """Returns warns of what listens for other machines; None where it does not.
+    """Warns of a server that other machines can reach; None if they cannot.
 
     Args:
         host: the address to listen at.
@@ -48,5 +48,5 @@ def check_free(host: str, port: int) -> None:
 
 
 def in_use(host: str, port: int) -> str:
-    """Returns says that somebody else listens there."""
+    """Describes the error that the port is in use."""
     return f"port {port} of {host} is in use: give another one with --port, or 0 for any"

@@ -71,14 +71,14 @@ def group_by_voxel(
 
 
 def group_means(groups: Groups, values: Float[Array, "P k"]) -> Float[Array, "P k"]:
-    """Returns the mean of something over the points of each voxel: at the leaders, elsewhere 0."""
+    """Averages values over the points of each voxel: at the leaders, elsewhere 0."""
     # The points take the places of their leaders; those that take no part have leader P, dropped.
     sums = jnp.zeros_like(values).at[groups.leader].add(values, mode="drop")
     return sums / jnp.maximum(groups.rgb_sum[:, 3:], 1.0)
 
 
 def points_of_pixels(frame: Frame, depth: Float[Array, "H W"]) -> Float[Array, "3 P"]:
-    """Returns points of all pixels in the world [m], row by row, coordinates first.
+    """Computes the points of all pixels in the world [m], row by row, coordinates first.
 
     The long axis last keeps the arithmetic in one vectorized loop; [H, W, 3] takes 3 ms more.
     """
@@ -103,7 +103,7 @@ def _leaders(
     torus_slot: Int[Array, " P"],
     valid: Bool[Array, " P"],
 ) -> Int[Array, " P"]:
-    """Returns the leading point of each point's voxel; P where the point is not valid."""
+    """Elects the leading point of each point's voxel; P where the point is not valid."""
     num = low.shape[0]
     point = jnp.arange(num, dtype=jnp.int32)
     num_slots = 1 << sum(_SCRATCH_BITS)
@@ -134,7 +134,7 @@ def _leaders(
 
 
 def edge_pixels(depth: Float[Array, "H W"], voxel_size: Float[Array, ""]) -> Bool[Array, "H W"]:
-    """Returns pixels on depth edges, whose color mixes foreground and background.
+    """Finds pixels on depth edges, whose color mixes foreground and background.
 
     An edge is a step of more than a voxel between neighbors that is no slope: the pixel also
     strays by more than a voxel from where its neighbors on both sides say that a plane runs. A
@@ -166,7 +166,7 @@ def edge_pixels(depth: Float[Array, "H W"], voxel_size: Float[Array, ""]) -> Boo
 def _breaks(
     depth: Float[Array, "H W"], around: list[Float[Array, "H W"]], limit: Float[Array, "..."]
 ) -> Bool[Array, "H W"]:
-    """Returns where the surface breaks by more than a limit [m], along its row or its column."""
+    """Finds where the surface breaks by more than a limit [m], along its row or its column."""
     # The floor keeps holes finite: infinity minus infinity would be NaN.
     inverse: Callable[[Array], Array] = lambda value: 1.0 / jnp.maximum(value, 1e-4)
     is_break = jnp.zeros(depth.shape, dtype=bool)
@@ -182,14 +182,14 @@ def _breaks(
 
 
 def _neighborhood(image: Float[Array, "H W"]) -> list[Float[Array, "H W"]]:
-    """Returns the 3x3 neighbors of every pixel, row by row; the border repeats its own pixels."""
+    """Shifts the image to the 3x3 neighbors of every pixel; the border repeats its pixels."""
     height, width = image.shape
     padded = jnp.pad(image, 1, mode="edge")
     return [padded[i : i + height, j : j + width] for i in range(3) for j in range(3)]
 
 
 def _median9(values: list[Float[Array, "H W"]]) -> Float[Array, "H W"]:
-    """Returns the median of nine images.
+    """Computes the median of nine images.
 
     Of sorted triples: the median of the largest minimum, the median of the medians and the
     smallest maximum.

@@ -129,7 +129,7 @@ def _join_map(state: MapState, other: MapState) -> MapState:
 
 @checked(a=a_map, b=a_map)
 def merge(a: MapState, b: MapState) -> MapState:
-    """Returns the map that has seen what `a` and `b` have seen, in a table of `a`'s capacity.
+    """Merges the observations of `a` and `b` into one map, in a table of `a`'s capacity.
 
     Exact: equal to integrating both sequences into one map, beyond rounding and row order.
     Voxels that find no row are counted in `dropped`; grow `a` first if both are large.
@@ -148,7 +148,7 @@ def merge(a: MapState, b: MapState) -> MapState:
 
 @checked(state=a_map)
 def grow(state: MapState, capacity: int) -> MapState:
-    """Returns the same map in a larger table. Outside jit: shapes change.
+    """Copies the map into a larger table. Not to be called under jit: shapes change.
 
     Raises:
         ValueError: a capacity that is not a power of two or smaller than the present one.

@@ -13,7 +13,7 @@ from r3jax.mapping.table import find
 @checked(state=a_map, points_world=points_of_3)
 @jax.jit
 def lookup(state: MapState, points_world: Float[Array, "*n 3"]) -> Int[Array, "*n"]:
-    """Returns the row of the voxel that holds each point; `state.capacity` where the map has none.
+    """Finds the row of the voxel that holds each point; `state.capacity` if the map has none.
 
     Args:
         state: the map.

@@ -134,7 +134,7 @@ class OccupancyGrid(eqx.Module):
 
 
 def cells_of(grid: OccupancyGrid) -> Cells:
-    """Returns all cells of a grid, z fastest."""
+    """Lists all cells of a grid, z fastest."""
     shape = grid.log_odds.shape
     x, y, z = (
         grid.origin[i] + (jnp.arange(n, dtype=jnp.float32) + 0.5) * grid.cell_size
@@ -153,7 +153,7 @@ a_grid = one(OccupancyGrid, "r3jax.empty_grid makes one", leaf="log_odds", ndim=
 
 
 def empty_grid(bounds: np.ndarray | Array, cell_size: float = 0.2) -> OccupancyGrid:
-    """Returns a grid in which nothing has been explored.
+    """Makes a grid in which nothing has been explored.
 
     Args:
         bounds: lower and upper corner of the box to cover, [2, 3] [m].
@@ -192,7 +192,7 @@ def empty_grid(bounds: np.ndarray | Array, cell_size: float = 0.2) -> OccupancyG
 
 
 def world_to_cell(grid: OccupancyGrid, points_world: Float[Array, "*n 3"]) -> Int[Array, "*n 3"]:
-    """Returns the cell that holds each point; outside the grid the index lies outside its shape."""
+    """Finds the cell that holds each point; outside the grid the index lies outside its shape."""
     # Reshaped, not broadcast: the tests let JAX raise on implicit rank promotion.
     origin = grid.origin.reshape((1,) * (points_world.ndim - 1) + (3,))
     index = jnp.floor((points_world - origin) / grid.cell_size)
@@ -201,20 +201,20 @@ def world_to_cell(grid: OccupancyGrid, points_world: Float[Array, "*n 3"]) -> In
 
 
 def cell_centers(grid: OccupancyGrid, cells: Int[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-    """Returns the center of each cell in the world [m]."""
+    """Computes the center of each cell in the world [m]."""
     origin = grid.origin.reshape((1,) * (cells.ndim - 1) + (3,))
     return origin + (cells.astype(jnp.float32) + 0.5) * grid.cell_size
 
 
 def centers_on_host(grid: OccupancyGrid, cells: np.ndarray) -> np.ndarray:
-    """Returns `cell_centers` of any number of cells [n, 3] in NumPy, float64: nothing compiles."""
+    """Computes `cell_centers` of cells [n, 3] by NumPy in float64: nothing compiles."""
     return np.asarray(grid.origin, np.float64) + (cells + 0.5) * float(grid.cell_size)
 
 
 def log_odds_at(
     grid: OccupancyGrid, points_world: Float[Array, "*n 3"], outside: float = 0.0
 ) -> Float[Array, "*n"]:
-    """Returns log-odds of the cell that holds each point; `outside` for points beyond the grid."""
+    """Reads the log-odds of the cell that holds each point; `outside` beyond the grid."""
     index = world_to_cell(grid, points_world)
     inside = _inside(grid, index)
     # Cell 0 stands in: a negative index would read from the far side of the grid.
@@ -224,7 +224,7 @@ def log_odds_at(
 
 @jax.jit
 def frontier(grid: OccupancyGrid) -> Bool[Array, "X Y Z"]:
-    """Returns the free cells with an unexplored face neighbor: where known space ends."""
+    """Finds the free cells with an unexplored face neighbor, where known space ends."""
     return grid.free & _has_face_neighbor(grid.unexplored)
 
 
@@ -330,7 +330,7 @@ def integrate_rays(
 def _hit_cells(
     grid: OccupancyGrid, frame: Frame, max_range: Float[Array, ""]
 ) -> Bool[Array, "X Y Z"]:
-    """Returns cells that hold at least one measured point within range."""
+    """Finds cells that hold at least one measured point within range."""
     x, y = _ray_slopes(frame.camera)
     is_measured = (frame.depth > 0.0) & jnp.isfinite(frame.depth)
     # Replaced before the arithmetic: inf times a slope of 0 is NaN.
@@ -361,7 +361,7 @@ def _ray_slopes(camera: Camera) -> tuple[Float[Array, "H W"], Float[Array, "H W"
 def _passed_cells(
     grid: OccupancyGrid, frame: Frame, max_range: Float[Array, ""]
 ) -> Bool[Array, "X Y Z"]:
-    """Returns cells of which at least four octants' centers were seen through."""
+    """Finds cells of which at least four octants' centers were seen through."""
     camera = frame.camera
     # The whole grid is turned into the camera's frame, since cells are asked, not rays.
     T_camera_world = invert_pose(frame.T_world_camera)
@@ -403,7 +403,7 @@ def _passed_cells(
 def _nearest_by_block(
     camera: Camera, depth: Float[Array, "H W"]
 ) -> tuple[Float[Array, "h w"], int]:
-    """Returns the least z-depth measured in each block of pixels, and the block's side [px].
+    """Finds the least z-depth in each block of pixels, and the block's side [px].
 
     A block without any measurement gets 0: nothing passes it.
     """
@@ -427,7 +427,7 @@ def _inside(grid: OccupancyGrid, index: Int[Array, "*n 3"]) -> Bool[Array, "*n"]
 
 
 def _distance(grid: OccupancyGrid, point: Float[Array, " 3"]) -> Float[Array, "X Y Z"]:
-    """Returns the distance from a point to every cell's center [m]."""
+    """Computes the distance from a point to every cell's center [m]."""
     return jnp.sqrt(squared_distance(grid, point))
 
 
@@ -446,7 +446,7 @@ def squared_distance(grid: OccupancyGrid, point: Float[Array, " 3"]) -> Float[Ar
 
 
 def _has_face_neighbor(mask: Bool[Array, "X Y Z"]) -> Bool[Array, "X Y Z"]:
-    """Returns cells with a face neighbor in the mask; beyond the grid there is none."""
+    """Finds cells with a face neighbor in the mask; beyond the grid there is none."""
     # Padded, not rolled: opposite faces of the grid are no neighbors.
     padded = jnp.pad(mask, 1)
     return (

@@ -82,7 +82,7 @@ class MapState(eqx.Module):
         return voxel_center(jnp.stack(unpack(self.key[0], self.key[1])), self.voxel_size)
 
     def center_of(self, row: Int[Array, " n"]) -> Float[Array, "3 n"]:
-        """Returns centers of the voxels in some rows [m]."""
+        """Computes the centers of the voxels in some rows [m]."""
         low, high = self.key[0, row], self.key[1, row]
         return voxel_center(jnp.stack(unpack(low, high)), self.voxel_size)
 
@@ -134,7 +134,7 @@ a_map = one(MapState, "r3jax.empty_map makes one", leaf="count", ndim=1)
 def empty_map(
     capacity: int = 1 << 17, voxel_size: float | int = 0.05, num_bins: int = 64
 ) -> MapState:
-    """Returns a map that has seen nothing.
+    """Makes a map without any observation.
 
     Args:
         capacity: rows of the table; a power of two.

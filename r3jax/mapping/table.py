@@ -43,7 +43,7 @@ def _slot(hashed: UInt32[Array, " n"], probe: Int[Array, ""], capacity: int) -> 
 def find(
     table: UInt32[Array, "2 N"], keys: UInt32[Array, "2 n"], valid: Bool[Array, " n"]
 ) -> Int[Array, " n"]:
-    """Returns the row of each key; N where it is absent or not valid."""
+    """Finds the row of each key; N where it is absent or not valid."""
     capacity = table.shape[1]
     hashed = hash_key(keys[0], keys[1])
 
@@ -69,7 +69,7 @@ def find(
 def find_or_insert(
     table: UInt32[Array, "2 N"], keys: UInt32[Array, "2 n"], valid: Bool[Array, " n"]
 ) -> tuple[UInt32[Array, "2 N"], Int[Array, " n"]]:
-    """Returns the row of each key, new rows for keys that had none.
+    """Finds the row of each key, and inserts keys that have none.
 
     Args:
         table: packed keys of the rows.
@@ -92,9 +92,9 @@ def find_or_insert(
 def _claim(
     is_empty: Bool[Array, " N"], hashed: UInt32[Array, " n"], wants: Bool[Array, " n"]
 ) -> Int[Array, " n"]:
-    """Returns an empty slot for each wanting item, along its probe sequence.
+    """Claims an empty slot for each wanting item, along its probe sequence.
 
-    N where there is none.
+    The slot is N if there is none.
     """
     capacity, num_items = is_empty.shape[0], hashed.shape[0]
     item = jnp.arange(num_items, dtype=jnp.int32)

@@ -70,7 +70,7 @@ def integrate_groups(
     camera_position: Float[Array, " 3"] | Float[Array, "P 3"],
     focal: Float[Array, ""],
 ) -> MapState:
-    """Returns one observation per touched voxel joins the map, `JOINED` voxels at a time.
+    """Adds one observation per touched voxel to the map, `JOINED` voxels at a time.
 
     Args:
         state: the map before.
@@ -132,7 +132,7 @@ def _by_formulas(
 def _by_kernels(
     state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
 ) -> MapState:
-    """Returns the same in machine code."""
+    """Integrates a frame by machine code."""
     factor = nan_unless_valid(frame.camera, frame.T_world_camera)
     # An unsound pose makes the range NaN, which no depth is below: the frame adds nothing.
     image = for_kernels(frame, factor * max_range, drop_edges)
@@ -169,7 +169,7 @@ def for_kernels(
 def _integrate(
     state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
 ) -> MapState:
-    """Returns one frame joins the map, by kernels on CPUs and by the formulas elsewhere."""
+    """Adds one frame to the map, by kernels on CPUs and by the formulas elsewhere."""
     add = by_platform(cpu=_by_kernels, default=_by_formulas)
     return add(state, frame, max_range, drop_edges)
 
@@ -318,9 +318,9 @@ def integrate_points(
     *,
     valid: ArrayLike | None = None,
 ) -> MapState:
-    """Returns points seen by one camera, or by a scanner, join the map.
+    """Adds the points seen by one camera, or by a scanner, to the map.
 
-    Like `integrate`, from points.
+    This is `integrate` for points.
 
     One call is one look: a voxel gets one observation, however many points fall into it. A LiDAR
     has rays instead of pixels: its `focal` is one over the angle between neighboring rays [1/rad],

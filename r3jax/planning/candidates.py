@@ -68,7 +68,7 @@ class Candidates(eqx.Module):
         return poses_along(self.position, self.direction)
 
     def poses_on_device(self) -> Float[Array, "C 4 4"]:
-        """Returns poses for scoring, float32."""
+        """Returns the poses for scoring, in float32."""
         return _poses_along(
             jnp.asarray(self.position, dtype=jnp.float32),
             jnp.asarray(self.direction, dtype=jnp.float32),
@@ -99,7 +99,7 @@ def candidates_at(positions: np.ndarray) -> Candidates:
 
 
 def host_generator(key: Array) -> np.random.Generator:
-    """Returns NumPy's generator, seeded by a JAX key.
+    """Makes NumPy's generator, seeded by a JAX key.
 
     Host code draws many small arrays of odd sizes.
     """
@@ -178,7 +178,7 @@ def draw_positions(
 
 
 def local_random(travel: Travel, num: int, radius: float = 0.5, *, key: Array) -> np.ndarray:
-    """Returns `num` positions uniform over the safe, reachable cells within `radius` of the robot.
+    """Draws `num` positions, uniform over the safe, reachable cells within `radius` of the robot.
 
     The cells are those with their center within the radius, and the robot's own (if it is known
     to be free). Several positions may share a cell. If the robot's own cell does not keep the
@@ -267,7 +267,7 @@ def _stops_round(travel: Travel, target: np.ndarray) -> np.ndarray:
 
 
 def spread(places: np.ndarray, num: int) -> np.ndarray:
-    """Returns indices of up to `num` places, each the farthest from those before (Gonzalez 1985).
+    """Selects up to `num` places, each the farthest from those before (Gonzalez 1985).
 
     The first is the one nearest to the middle of all: it does not depend on their order, but for
     ties.
@@ -291,13 +291,13 @@ def spread(places: np.ndarray, num: int) -> np.ndarray:
 
 
 def in_plain_view(travel: Travel, a: np.ndarray, b: np.ndarray) -> bool:
-    """Returns True if the straight line between two positions [m] runs through known free space."""
+    """Checks whether the straight line between two positions [m] lies in known free space."""
     scale = travel.cell_size
     return segment_is_inside(travel.free, (a - travel.origin) / scale, (b - travel.origin) / scale)
 
 
 def random_directions(num: int, *, key: Array) -> np.ndarray:
-    """Returns `num` directions uniform on the sphere, [num, 3] float64.
+    """Draws `num` directions uniform on the sphere, [num, 3] float64.
 
     Not bounded in elevation: floors and ceilings are part of the scene, and test views look
     straight up and down too.

@@ -133,23 +133,23 @@ class GreedyPolicy(ABC):
         del camera, grid
 
     def draw(self, situation: Situation, *, key: Array) -> Drawn:
-        """Returns the candidates: those of R3, unless the policy has its own."""
+        """Draws the candidates: those of R3, unless the policy has its own."""
         travel, grid = situation.travel, situation.scoring_grid
         return Drawn(random_views(travel, grid, self.config, key=key), situation.memory)
 
     @abstractmethod
     def score(self, situation: Situation, candidates: Candidates, *, key: Array) -> Scored:
-        """Returns the candidates, turned if the policy does so, and `utility` [C] among others."""
+        """Scores the candidates, turned if the policy does so: `utility` [C] and others."""
 
     def score_again(
         self, situation: Situation, candidates: Candidates, *, before: np.ndarray, key: Array
     ) -> Scored:
-        """Returns `score` of candidates of an earlier decision, whose totals [C] were `before`."""
+        """Scores candidates of an earlier decision, whose totals [C] were `before`."""
         del before
         return self.score(situation, candidates, key=key)
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
-        """Returns `total` of each candidate, from `utility` and `path` [C]: U_view."""
+        """Computes the `total` of each candidate from `utility` and `path` [C]: U_view."""
         return net_utility(utilities["utility"], utilities["path"], self.config.lambda2)
 
     def conclude(
@@ -170,7 +170,7 @@ class GreedyPolicy(ABC):
         return initial_state(camera, grid, memory, self.config.motion)
 
     def observe(self, state: PlannerState, map_state: MapState, frame: Frame) -> PlannerState:
-        """Returns the map holds all that most policies need of a frame."""
+        """Leaves the state unchanged: the map contains all that most policies need of a frame."""
         del map_state, frame
         return state
 
@@ -183,7 +183,7 @@ class GreedyPolicy(ABC):
         *,
         key: Array,
     ) -> tuple[Decision | None, PlannerState, PlanInfo]:
-        """Returns the candidate with the greatest total, of those that the robot may take."""
+        """Chooses the candidate with the greatest total, of those that the robot may take."""
         rule = Rule(self.draw, self.score, self.weigh, self.conclude)
         return decide(rule, (state, map_state, grid, T_world_camera), self.config, key=key)
 
@@ -218,7 +218,7 @@ class GreedyPolicy(ABC):
         T_world_camera: np.ndarray,
         waypoints: np.ndarray,
     ) -> PlannerState:
-        """Returns the cells on the path, and what the latest view failed to show."""
+        """Records the cells on the path, and counts those that the latest view failed to show."""
         state, situation = look_round(state, map_state, grid, T_world_camera, self.config)
         return with_path(state, situation.travel, waypoints)
 
@@ -230,7 +230,7 @@ Known = tuple[PlannerState, MapState, OccupancyGrid, np.ndarray]
 def decide(
     rule: Rule, known: Known, config: PlannerConfig, *, key: Array
 ) -> tuple[Decision | None, PlannerState, PlanInfo]:
-    """Returns one decision, from drawing to choice.
+    """Makes one decision, from drawing to choice.
 
     Args:
         rule: of the policy.
@@ -304,7 +304,7 @@ def look_round(
     T_world_camera: np.ndarray,
     config: PlannerConfig,
 ) -> tuple[PlannerState, Situation]:
-    """Returns finds where the robot can go, what it may do next, and which cells can be explored.
+    """Finds where the robot can go, its possible moves, and which cells can be explored.
 
     Args:
         state: the policy's memory.
@@ -398,9 +398,9 @@ def explain_path(
 
 
 def best_of(planned: Decision) -> tuple[Candidates, np.ndarray]:
-    """Returns the best candidates of an earlier decision, and their totals.
+    """Selects the best candidates of an earlier decision, with their totals.
 
-    One shape, to compile once.
+    Their number is fixed, so that scoring compiles once.
     """
     finite = np.isfinite(planned.utilities["path"])
     total = np.where(finite, planned.utilities["total"], -np.inf)
@@ -458,7 +458,7 @@ def initial_state(
 
 
 def with_path(state: PlannerState, travel: Travel, waypoints: np.ndarray) -> PlannerState:
-    """Counts a path over waypoints [K, 3] [m] in."""
+    """Adds the cells of a path over waypoints [K, 3] [m] to the trail."""
     # All cells that the lines cross, not the waypoints alone: the path back must be connected.
     return replace(state, trail=state.trail | travel.cells_along(waypoints))
 
@@ -478,7 +478,7 @@ def _decision_for(
     travel: Travel,
     limits: Limits,
 ) -> Decision:
-    """Returns the candidate `best`, the path to it, and what else was on offer."""
+    """Builds the decision for candidate `best`: the path to it, and the other candidates."""
     waypoints = travel.path(candidates.position[best])
     # Measured again: shortcuts may have made the path shorter than the length that was weighed.
     length = float(np.linalg.norm(np.diff(waypoints, axis=0), axis=1).sum())
@@ -519,7 +519,7 @@ def is_shut_in(travel: Travel, taken: np.ndarray) -> bool:
 def _nothing_in_reach(
     situation: Situation, config: PlannerConfig, stopwatch: "Stopwatch", *, is_shut_in: bool = False
 ) -> PlanInfo:
-    """Returns the answer where no candidate was found: safe places exist, or not even those."""
+    """Reports that no candidate was found: safe places exist, or not even those."""
     travel = situation.travel
     centers = travel.centers(np.argwhere(travel.safe))
     # Safe places within the radius that no path leads to are told from none at all.

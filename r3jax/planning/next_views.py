@@ -60,7 +60,7 @@ def next_views(
     poses: ArrayLike | None = None,
     config: PlannerConfig | None = None,
 ) -> NextViews:
-    """Returns the k most useful views, each on top of those before it. Not to be called under jit.
+    """Finds the k most useful views, each given those before it. Not to be called under jit.
 
     For one camera that will take them all, for several that take one each, for a person with a
     list. The path between them is not counted: a robot's next view is a policy's `decide`.
@@ -102,7 +102,7 @@ def next_views(
 
 
 def _positions_in(grid: OccupancyGrid, safe: np.ndarray, config: PlannerConfig) -> np.ndarray:
-    """Returns positions [C, 3] float64 [m], spread over the cells that keep the margin."""
+    """Spreads positions [C, 3] float64 [m] over the cells that keep the margin."""
     cells = np.argwhere(safe)
     if len(cells) == 0:
         raise InputError(

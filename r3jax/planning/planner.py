@@ -140,7 +140,7 @@ def take_in(planner: Planner, frame: Frame) -> Planner:
 def decide(
     planner: Planner, T_world_camera: ArrayLike, key: Array
 ) -> tuple[Decision | None, Planner, PlanInfo]:
-    """Returns decides where to look next.
+    """Decides where to look next.
 
     Args:
         planner: what is known.

@@ -137,7 +137,7 @@ class Policy(Protocol):
         *,
         key: Array,
     ) -> tuple[Decision | None, Any, PlanInfo]:
-        """Returns the next view, or None with the reason in the info."""
+        """Chooses the next view; None if there is none, with the reason in the info."""
         ...
 
     def follow(

@@ -136,9 +136,9 @@ def _climb(
     lowest: Float[Array, "K 5"],
     highest: Float[Array, "K 5"],
 ) -> Float[Array, "K 5"]:
-    """Returns where climbs from poses end.
+    """Climbs the utility from poses by its gradient.
 
-    Positions [m], azimuths and elevations [rad], within bounds.
+    Returns positions [m], azimuths and elevations [rad], within bounds.
     """
 
     def pose_at(numbers: Float[Array, " 5"]) -> Float[Array, "4 4"]:
@@ -170,9 +170,9 @@ def _climb(
 
 
 def _best(candidates: Candidates, total: np.ndarray, num: int) -> np.ndarray:
-    """Returns indices of the `num` best, no view twice while there are others.
+    """Selects the `num` best, no view twice while there are others.
 
-    None if none can be reached.
+    The result is empty if none can be reached.
 
     A robot that cannot move draws its own place again and again.
     """
@@ -187,7 +187,7 @@ def _best(candidates: Candidates, total: np.ndarray, num: int) -> np.ndarray:
 
 
 def free_box(travel: Travel, position: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns a box round a place all over which the robot may stop.
+    """Finds a box round a place in which the robot may stop everywhere.
 
     The box of cells round the place's own grows, one layer at a time, over safe cells to which a
     way leads, and ends where candidates do: a quarter of a cell from the middles of its outermost.

@@ -52,7 +52,7 @@ def describe(name: str) -> str:
 
 
 def source_of(name: str) -> str:
-    """Returns says where a policy's rule comes from, in a phrase.
+    """Returns the origin of a policy's rule, in a phrase.
 
     Raises:
         ValueError: no policy has that name.

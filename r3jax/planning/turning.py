@@ -55,7 +55,7 @@ class Turning:
         return bool(turn(self.start, self.end) <= self.allowed.sum() + _SAME)
 
     def feasible(self, piece: int, now: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Returns which directions the camera may have after a piece.
+        """Finds which directions the camera may have after a piece.
 
         Args:
             piece: number of the piece.
@@ -69,9 +69,9 @@ class Turning:
         return in_time & (turn(directions, self.end) <= self.allowed[piece + 1 :].sum() + _SAME)
 
     def nearest(self, piece: int, now: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-        """Returns the feasible direction nearest to a wanted one, [2].
+        """Finds the feasible direction nearest to a wanted one, [2].
 
-        To the spacing of a lattice.
+        It is exact up to the spacing of a lattice.
         """
         wanted = np.array([wanted[0], np.clip(wanted[1], *self.elevations)])
         allowed = self.allowed[piece]
@@ -82,9 +82,9 @@ class Turning:
     def best(
         self, piece: int, now: np.ndarray, directions: np.ndarray, scores: np.ndarray
     ) -> np.ndarray:
-        """Returns the feasible direction with the greatest score.
+        """Finds the feasible direction with the greatest score.
 
-        If there is none, on towards the end.
+        If there is none, the camera turns on towards the end.
 
         Args:
             piece: number of the piece.
@@ -99,19 +99,19 @@ class Turning:
 
 
 def turn(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Returns the length of the turn between directions [..., 2], [...] [rad]."""
+    """Computes the length of the turn between directions [..., 2], [...] [rad]."""
     difference = _difference(first, second)
     return np.asarray(np.hypot(difference[..., 0], difference[..., 1]))
 
 
 def _difference(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Returns the from one direction to another, [..., 2], round the shorter side."""
+    """Computes the turn from one direction to another, [..., 2], round the shorter side."""
     difference = np.asarray(second, dtype=np.float64) - first
     return np.stack([wrapped(difference[..., 0]), difference[..., 1]], axis=-1)
 
 
 def _towards(now: np.ndarray, goal: np.ndarray, most: float) -> np.ndarray:
-    """Returns the direction after a turn of at most `most` [rad] straight to a goal."""
+    """Turns by at most `most` [rad] straight to a goal, and returns the new direction."""
     whole = float(turn(now, goal))
     return now + min(1.0, most / max(whole, 1e-12)) * _difference(now, goal)
 
@@ -130,9 +130,9 @@ def pose_towards(position: np.ndarray, direction: np.ndarray) -> np.ndarray:
 
 
 def along(offset: np.ndarray, now: np.ndarray) -> np.ndarray:
-    """Returns the direction [2] of an offset [3].
+    """Computes the direction [2] of an offset [3].
 
-    Of one that is vertical or nothing the azimuth stays.
+    If the offset is vertical or zero, the azimuth stays.
     """
     level = float(np.hypot(offset[0], offset[1]))
     azimuth = now[0] if level < 1e-6 else np.arctan2(offset[1], offset[0])
@@ -142,7 +142,7 @@ def along(offset: np.ndarray, now: np.ndarray) -> np.ndarray:
 def axes_within(
     elevations: tuple[float, float], num_bins: int = 526
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the axes of a panorama that a camera may have, moved into what it may tilt to.
+    """Finds the axes of a panorama that a camera may have, moved into its range of tilt.
 
     Those whose bins, caps of 1 / B of the sphere, reach into the allowed elevations; at least those
     that are nearest.
@@ -176,9 +176,9 @@ def worthwhile_grid(
 
 
 def exhausted_cells(policy_state: Any) -> np.ndarray | None:
-    """Returns cells that enough views failed to show, [X, Y, Z] bool.
+    """Finds cells that enough views failed to show, [X, Y, Z] bool.
 
-    None if the policy does not count.
+    It is None if the policy does not count them.
     """
     if not isinstance(policy_state, PlannerState):
         return None
@@ -211,9 +211,9 @@ def panorama_scores(
     position: np.ndarray,
     scoring: ScoringConfig,
 ) -> np.ndarray:
-    """Returns what a view in the direction of each axis of a panorama would add, [B].
+    """Scores the views in the directions of all axes of a panorama, [B].
 
-    One depth buffer.
+    They share one depth buffer.
     """
     place = np.asarray(position, dtype=np.float32)[None]
     return np.asarray(

@@ -36,7 +36,7 @@ def sums_in_view(
     config: ScoringConfig,
     num_bins: int,
 ) -> tuple[Float[Array, " B"], Float[Array, " B"]]:
-    """Returns `formulas.sums_in_view`."""
+    """Computes `formulas.sums_in_view`."""
     del position  # that of the view; it only carries the derivative
     deficits, unexplored = _sums(voxels, cells, view, focal, config, num_bins, keep=False)
     return deficits, unexplored
@@ -56,7 +56,7 @@ def sums_and_seen(
     config: ScoringConfig,
     num_bins: int,
 ) -> tuple[Float[Array, " B"], Float[Array, " B"], UInt8[Array, " p"], UInt8[Array, " q"]]:
-    """Returns `sums_in_view`, and which voxels and cells are in it: bits in bytes."""
+    """Computes `sums_in_view`, and marks the voxels and cells that are in it: bits in bytes."""
     return _sums(voxels, cells, view, focal, config, num_bins, keep=True)
 
 
@@ -98,7 +98,7 @@ def change_of_sums(
     config: ScoringConfig,
     num_bins: int,
 ) -> tuple[Float[Array, " B"], Float[Array, " B"]]:
-    """Returns `formulas.change_of_sums`."""
+    """Computes `formulas.change_of_sums`."""
     forms = config.forms
 
     def kernel(known: Any, items: Any) -> tuple[Array, Array]:
@@ -127,7 +127,7 @@ def mean_in_pixels(
     config: ScoringConfig,
     forms: Forms,
 ) -> Float[Array, ""]:
-    """Returns `formulas.mean_in_pixels`."""
+    """Computes `formulas.mean_in_pixels`."""
     del position  # that of the view; it only carries the derivative
     layout = layout_of(view)
 
@@ -157,7 +157,7 @@ def _mean_in_pixels_jvp(forms: Forms, primals: Any, tangents: Any) -> Any:
 
 @jax.custom_jvp
 def rows_in_pixels(voxels: MapState, view: View, config: ScoringConfig) -> Int[Array, "h w"]:
-    """Returns `formulas.rows_in_pixels`."""
+    """Computes `formulas.rows_in_pixels`."""
     layout = layout_of(view)
 
     def kernel(voxels: MapState, items: Any) -> Array:
@@ -184,7 +184,7 @@ def _rows_in_pixels_jvp(primals: Any, tangents: Any) -> Any:
 def terms_of_rows(
     voxels: MapState, position: Float[Array, " 3"], focal: Float[Array, ""], forms: Forms
 ) -> Renderability:
-    """Returns `formulas.terms_of_rows`."""
+    """Computes `formulas.terms_of_rows`."""
 
     def kernel(voxels: MapState, items: Any) -> tuple[Array, ...]:
         position, focal = items

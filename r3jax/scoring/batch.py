@@ -43,7 +43,7 @@ def score_views(
     poses: Float[Array | np.ndarray, "C 4 4"],
     config: ScoringConfig,
 ) -> ViewUtility:
-    """Returns `view_utility` of every pose; fields of shape [C]. Not to be called under jit."""
+    """Computes `view_utility` of every pose; fields of shape [C]. Not to be called under jit."""
     poses = jnp.asarray(poses, dtype=jnp.float32)
     voxels, cells = _at_hand(state, grid, poses[:, :3, 3], config)
     return score_views_near(voxels, cells, camera, poses, config)
@@ -57,7 +57,7 @@ def score_positions(
     config: ScoringConfig,
     allowed: Bool[Array | np.ndarray, "C B"] | None = None,
 ) -> Panorama:
-    """Returns `panorama` of every position; fields of shape [C, ...]. Not to be called under jit.
+    """Computes `panorama` of every position; fields of shape [C, ...]. Not to be called under jit.
 
     Args:
         state: the map.
@@ -95,7 +95,7 @@ def score_views_near(
     poses: Float[Array, "C 4 4"],
     config: ScoringConfig,
 ) -> ViewUtility:
-    """Returns `score_views` of voxels and cells that `near` gathered."""
+    """Computes `score_views` of voxels and cells that `near` gathered."""
     return map_over_devices(
         functools.partial(_score_views, voxels, cells, camera, config), poses, threads=1
     )
@@ -109,7 +109,7 @@ def score_positions_near(
     config: ScoringConfig,
     allowed: Bool[Array | np.ndarray, "C B"] | None = None,
 ) -> Panorama:
-    """Returns `score_positions` of voxels and cells that `near` gathered."""
+    """Computes `score_positions` of voxels and cells that `near` gathered."""
     score = functools.partial(_score_positions, voxels, cells, camera, config)
     return map_over_devices(score, (positions, _all_if_none(allowed, positions, config)), threads=1)
 
@@ -122,7 +122,7 @@ def cache_positions_near(
     config: ScoringConfig,
     allowed: Bool[Array | np.ndarray, "C B"] | None = None,
 ) -> tuple[Panorama, PanoramaCache]:
-    """Returns `score_positions_near`, and what `score_cached_near` needs to do it again."""
+    """Computes `score_positions_near`, and caches what `score_cached_near` needs."""
     score = functools.partial(_cache_positions, voxels, cells, camera, config)
     return map_over_devices(score, (positions, _all_if_none(allowed, positions, config)), threads=1)
 
@@ -137,7 +137,7 @@ def score_cached_near(
     allowed: Bool[Array | np.ndarray, "C B"] | None = None,
     threads: int | None = None,
 ) -> Panorama:
-    """Returns `score_positions_near` after imagined views, from what was kept before them.
+    """Updates `score_positions_near` after imagined views, from the cache before them.
 
     `threads` is that of `map_over_devices`: 1 for who calls from threads.
     """
@@ -151,7 +151,7 @@ def _all_if_none(
     positions: Float[Array, "C 3"],
     config: ScoringConfig,
 ) -> Bool[Array, "C B"]:
-    """Returns the axes that are allowed, or all."""
+    """Returns the allowed axes; all if `allowed` is None."""
     if allowed is None:
         # All true, not None: the same compiled program then serves calls with and without a choice.
         allowed = np.ones((positions.shape[0], config.panorama_bins), dtype=bool)

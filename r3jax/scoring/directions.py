@@ -65,9 +65,9 @@ def _seen_directions_jvp(
 def nearest_seen(
     visited: UInt32[Array, "W ..."], direction: Float[Array, "3 ..."], num_bins: int
 ) -> Float[Array, "..."]:
-    """Returns the cosine alone: max_k <q_k, r> over the visited bins, in [-1, 1].
+    """Computes the cosine max_k <q_k, r> over the visited bins, in [-1, 1].
 
-    -1 where there is none.
+    It is -1 if no bin was visited.
 
     Args:
         visited: as in `seen_directions`.

@@ -61,7 +61,7 @@ def explain_view(
     T_world_camera: Float[Array, "4 4"],
     config: ScoringConfig | None = None,
 ) -> Explanation:
-    """Returns the utility of one view, divided among its causes, for every voxel and in total.
+    """Divides the utility of one view among its causes, for every voxel and in total.
 
     It sees what `view_utility` of the same view sees. A voxel that was observed once only is
     never called inconsistent: nothing was measured against it.
@@ -96,7 +96,7 @@ def _divide_visible(
     focal: Float[Array, ""],
     forms: Forms,
 ) -> _Sums:
-    """Returns deficits of the visible voxels by cause; summed in the order in which U_R is."""
+    """Attributes the deficits of the visible voxels to causes, summed in the order of U_R."""
     num = voxels.capacity
 
     def add(index: Int[Array, " K"], valid: Bool[Array, " K"], sums: _Sums) -> _Sums:

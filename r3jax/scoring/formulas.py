@@ -56,7 +56,7 @@ def sums_of_seen(
     forms: Forms,
     num_bins: int,
 ) -> tuple[Float[Array, " B"], Float[Array, " B"]]:
-    """Returns `sums_in_view` of voxels and cells that are known to be seen."""
+    """Computes `sums_in_view` of voxels and cells that are known to be seen."""
     deficit = 1.0 - score_voxels(voxels, position, focal, forms).value
     deficit, unexplored = jnp.where(seen[0], deficit, 0.0), seen[1].astype(jnp.float32)
     points = jnp.stack([cells.x, cells.y, cells.z])
@@ -75,7 +75,7 @@ def change_of_sums(
     forms: Forms,
     num_bins: int,
 ) -> tuple[Float[Array, " B"], Float[Array, " B"]]:
-    """Returns sums up what imagined views have changed of `sums_in_view` where the same is seen.
+    """Sums the changes of `sums_in_view` by imagined views where the same is seen.
 
     Args:
         before: voxels and cells before the views.
@@ -147,7 +147,7 @@ def mean_of_rows(
 def terms_of_rows(
     voxels: MapState, position: Float[Array, " 3"], focal: Float[Array, ""], forms: Forms
 ) -> Renderability:
-    """Returns `score_voxels` of every row; where the position is not finite, every term is NaN."""
+    """Computes `score_voxels` of every row; NaN if the position is not finite."""
     factor = jnp.where(jnp.all(jnp.isfinite(position)), 1.0, jnp.nan)
     terms = score_voxels(voxels, position, focal, forms)
     return jax.tree.map(lambda term: factor * term, terms)
@@ -166,9 +166,9 @@ def sum_by_direction(
     position: Float[Array, " 3"],
     num_bins: int,
 ) -> Float[Array, " B"]:
-    """Returns sums weights into the bins in which points lie, seen from a position.
+    """Sums weights into the bins in which points lie, seen from a position.
 
-    1 bin sums all.
+    A single bin sums all weights.
     """
     if num_bins == 1:
         return jnp.sum(weight, keepdims=True)

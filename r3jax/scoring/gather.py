@@ -29,7 +29,7 @@ Absent ones cost little."""
 def gather_in_range(
     state: MapState, grid: OccupancyGrid, positions: Float[Array, "C 3"], config: ScoringConfig
 ) -> tuple[MapState, Cells, Int[Array, " n"]]:
-    """Returns the voxels and unexplored cells that at least one of the positions may see.
+    """Gathers the voxels and unexplored cells that at least one of the positions may see.
 
     Returns:
         Voxels and cells, padded with absent ones, and each voxel's row in the map (N: padding).
@@ -63,7 +63,7 @@ def _masks(
     high: Float[Array, " 3"],
     config: ScoringConfig,
 ) -> tuple[Bool[Array, " n"], Bool[Array, " c"]]:
-    """Returns voxels and unexplored cells within range of a box."""
+    """Finds voxels and unexplored cells within range of a box."""
 
     def is_near(points: Coordinates, margin: Float[Array, ""] | float) -> Bool[Array, " k"]:
         # To the box it is no farther than to a position in it: nothing in range is lost.

@@ -72,7 +72,7 @@ def panorama_of(
     config: ScoringConfig,
     allowed: Bool[Array, " B"] | None = None,
 ) -> Panorama:
-    """Returns `panorama` of voxels and cells that are already at hand.
+    """Computes `panorama` of voxels and cells that were already gathered.
 
     Args:
         voxels: of the map.
@@ -97,7 +97,7 @@ def panorama_of_bins(
     config: ScoringConfig,
     allowed: Bool[Array, " B"] | None = None,
 ) -> Panorama:
-    """Returns the panorama whose bins have these scores."""
+    """Builds the panorama whose bins have these scores."""
     num_bins = config.panorama_bins
     directions = bins_in_view(camera, num_bins) @ bins
     # Of equal scores the first wins: the choice can be repeated.
@@ -107,10 +107,7 @@ def panorama_of_bins(
 
 
 def bins_in_view(camera: Camera, num_bins: int) -> Float[Array, "B B"]:
-    """Returns 1 where bin j lies in the roll-free, rectangular field of view with axis q_k.
-
-    N(k).
-    """
+    """Marks by 1 the bins j in the roll-free, rectangular field of view with axis q_k: N(k)."""
     lattice = jnp.asarray(fibonacci_lattice(num_bins), dtype=jnp.float32)
     R = jax.vmap(lambda q: pose_along(jnp.zeros(3, dtype=jnp.float32), q)[:3, :3])(lattice)
     x, y, z = jnp.einsum("kij,bi->jkb", R, lattice)

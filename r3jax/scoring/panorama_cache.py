@@ -35,7 +35,7 @@ class PanoramaCache(eqx.Module):
 
     @jax.jit
     def at(self, index: Int[Array, " k"]) -> "PanoramaCache":
-        """Returns the those of some of many positions."""
+        """Selects the caches of some positions out of many."""
         return PanoramaCache(self.bin_scores[index], self.voxels[index], self.cells[index])
 
 
@@ -47,7 +47,7 @@ def cached_panorama(
     config: ScoringConfig,
     allowed: Bool[Array, " B"] | None = None,
 ) -> tuple[Panorama, PanoramaCache]:
-    """Returns `panorama_of`, and what is needed to score it again."""
+    """Computes `panorama_of`, and caches what is needed to score it again."""
     view, num_bins = panorama_view(position, config), config.panorama_bins
     deficits, unexplored, *seen = sums_and_seen(voxels, cells, view, camera.focal, config, num_bins)
     bins = deficits + config.lambda1 * unexplored
@@ -64,7 +64,7 @@ def panorama_from_cache(
     config: ScoringConfig,
     allowed: Bool[Array, " B"] | None = None,
 ) -> Panorama:
-    """Returns `panorama_of` of what is known after imagined views, from what was kept before them.
+    """Updates `panorama_of` after imagined views, from the cache before them.
 
     Args:
         kept: of this position, before.

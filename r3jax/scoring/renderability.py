@@ -40,7 +40,7 @@ def _voxel_renderability(
 def voxel_renderability(
     state: MapState, camera_position: ArrayLike, focal: ArrayLike = 1.0, kappa: str = "box"
 ) -> Renderability:
-    """Returns the terms of every row of the map, as seen from one camera position; no occlusion.
+    """Computes the terms of every row, as seen from one camera position; no occlusion.
 
     Args:
         state: the map.
@@ -94,7 +94,7 @@ def term_images(
     T_world_camera: Float[Array, "4 4"],
     config: ScoringConfig | None = None,
 ) -> TermImages:
-    """Returns R and its terms, of the voxel that each pixel of one view sees.
+    """Computes R and its terms, of the voxel that each pixel of one view sees.
 
     In the pixels of `renderability_image`, and differentiable as it is.
     """
@@ -119,7 +119,7 @@ def renderability_image(
     T_world_camera: Float[Array, "4 4"],
     config: ScoringConfig | None = None,
 ) -> Float[Array, "h w"]:
-    """Returns R of the voxel that each pixel of one view sees; 0 where it sees none.
+    """Computes R of the voxel that each pixel of one view sees; 0 where it sees none.
 
     The image is a depth buffer of the voxels, at most `config.zbuffer_size` pixels wide or
     high, with the camera's field of view. Differentiable with respect to the pose: which voxel
@@ -136,7 +136,7 @@ def renderability(
     T_world_camera: Float[Array, "4 4"],
     config: ScoringConfig | None = None,
 ) -> Float[Array, ""]:
-    """Returns how well one view could be rendered: the mean of `renderability_image`, in [0, 1].
+    """Rates one view: the mean of `renderability_image`, in [0, 1].
 
     Written for one pose; `jax.vmap` it over many:
 

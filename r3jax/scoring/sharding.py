@@ -42,7 +42,7 @@ def score_on_devices(
     candidates: Candidates,
     devices: Sequence[Any],
 ) -> Any:
-    """Returns `score(*known, candidates)` with the candidates spread over the devices.
+    """Computes `score(*known, candidates)` with the candidates spread over the devices.
 
     Each candidate's score is computed as on one device: the numbers are the same, but for last
     bits where a share is a single candidate, whose loop XLA unrolls and fuses otherwise.

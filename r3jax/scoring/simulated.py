@@ -36,7 +36,7 @@ def simulate_view(
     T_world_camera: Float[Array, "4 4"],
     config: ScoringConfig,
 ) -> tuple[MapState, Bool[Array, " N"]]:
-    """Returns the map after a view that is only imagined.
+    """Updates the map by a view that is only imagined.
 
     Args:
         state: the map before.
@@ -59,7 +59,7 @@ def imagine_view(
     T_world_camera: Float[Array, "4 4"],
     config: ScoringConfig,
 ) -> tuple[MapState, OccupancyGrid]:
-    """Returns the map and grid for a decision that takes a view as taken.
+    """Updates map and grid for a decision, as if a view had been taken.
 
     The unexplored cells that the view would show no longer count.
 
@@ -83,7 +83,7 @@ def simulate_view_near(
     T_world_camera: Float[Array, "4 4"],
     config: ScoringConfig,
 ) -> tuple[MapState, Cells]:
-    """Returns voxels and cells at hand after a view that is only imagined.
+    """Updates gathered voxels and cells by a view that is only imagined.
 
     The unexplored cells that the view shows are no longer unexplored.
 
@@ -106,7 +106,7 @@ def observed(
     position: Float[Array, " 3"],
     focal: Float[Array, ""],
 ) -> MapState:
-    """Returns the voxels with one more, imagined, observation of those that are visible.
+    """Adds one imagined observation to each visible voxel.
 
     Args:
         voxels: before.

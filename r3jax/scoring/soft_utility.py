@@ -78,7 +78,7 @@ class SoftUtility(eqx.Module):
     """Of the image's sides [rad], and of the range as a share of it."""
 
     def __call__(self, T_world_camera: Float[Array, "4 4"]) -> Float[Array, ""]:
-        """Returns the soft utility of a view."""
+        """Computes the soft utility of a view."""
         R, position = T_world_camera[:3, :3], T_world_camera[:3, 3]
         # Products and sums, not a matrix product: on some devices those round to ten bits.
         offset = self.points - position[:, None]
@@ -145,7 +145,7 @@ def soft_utility_near(
     config: ScoringConfig,
     softness: Float[Array, ""] | float = SOFTNESS,
 ) -> SoftUtility:
-    """Returns `soft_utility` of voxels and cells that are already at hand."""
+    """Prepares `soft_utility` of voxels and cells that were already gathered."""
     farther = eqx.tree_at(lambda c: c.max_range, config, _RANGE_MARGIN * config.max_range)
     view = pinhole_view(_widened(camera), T_world_camera, farther)
     seen, unexplored = seen_in_view(voxels, cells, view, farther)
@@ -167,7 +167,7 @@ def soft_utility_near(
 
 
 def _widened(camera: Camera) -> Camera:
-    """Returns a camera of as many pixels that sees `_MARGIN` more on every side."""
+    """Widens a camera by `_MARGIN` on every side, with the same number of pixels."""
 
     def lens(focal: Array, center: Array, size: int) -> tuple[Array, float]:
         # Even about the axis: as much on each side as on the wider one.
@@ -180,9 +180,9 @@ def _widened(camera: Camera) -> Camera:
 
 
 def _sample(chosen: Bool[Array, " n"], most: int) -> tuple[Int[Array, " m"], Float[Array, " m"]]:
-    """Returns numbers of at most `most` of the chosen, evenly, and how many each stands for; 0.
+    """Samples evenly at most `most` of the chosen, with the number that each stands for.
 
-    Padding.
+    The number is 0 for padding.
 
     Voxels lie in the order of a hash table: a sample by number is one by chance.
     """

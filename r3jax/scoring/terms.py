@@ -42,7 +42,7 @@ class Renderability(eqx.Module):
 def consistency(
     count: Float[Array, " n"], m2: Float[Array, " n"], form: str = "trace"
 ) -> Float[Array, " n"]:
-    """Returns delta: how consistent the colors of a voxel are, in [0, 1].
+    """Computes delta: how consistent the colors of a voxel are, in [0, 1].
 
     `trace` is Algorithm 2 of arXiv 2601.07484, 1 - sqrt(2 / 1.5) sqrt(tr(M) / (n - 1));
     `pairwise` is its text, one minus the mean squared difference over pairs, which equals
@@ -61,7 +61,7 @@ def score_voxels(
     forms: Forms = PAPER,
     kappa_is_one: Bool[Array, " n"] | None = None,
 ) -> Renderability:
-    """Returns the terms of every voxel as seen from one camera position.
+    """Computes the terms of every voxel as seen from one camera position.
 
     Args:
         voxels: what is known of them.

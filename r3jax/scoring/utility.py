@@ -37,7 +37,7 @@ def view_utility(
     T_world_camera: Float[Array, "4 4"],
     config: ScoringConfig | None = None,
 ) -> ViewUtility:
-    """Returns U_G and U_R of one view (arXiv 2601.07484).
+    """Computes U_G and U_R of one view (arXiv 2601.07484).
 
     Visible means in the field of view, not hidden by voxels, and within `config.max_range`.
     Written for one pose; `jax.vmap` it over many, or use `scoring.batch.score_views`.
@@ -55,7 +55,7 @@ def utility_of_view(
     T_world_camera: Float[Array, "4 4"],
     config: ScoringConfig,
 ) -> ViewUtility:
-    """Returns `view_utility` of voxels and cells that are already at hand."""
+    """Computes `view_utility` of voxels and cells that were already gathered."""
     view = pinhole_view(camera, T_world_camera, config)
     position = T_world_camera[:3, 3]
     deficit, unexplored = sums_in_view(voxels, cells, view, position, camera.focal, config, 1)
@@ -71,7 +71,7 @@ def visible_unexplored(
     T_world_camera: Float[Array, "4 4"],
     config: ScoringConfig,
 ) -> Bool[Array, "X Y Z"]:
-    """Returns the cells that U_G of a view counts."""
+    """Finds the cells that U_G of a view counts."""
     view = pinhole_view(camera, T_world_camera, config)
     _, unexplored = seen_in_view(state, cells_of(grid), view, config)
     return unexplored.reshape(grid.log_odds.shape)

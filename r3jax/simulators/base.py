@@ -38,7 +38,7 @@ class Simulator(Protocol):
         ...
 
     def render(self, T_world_camera: np.ndarray) -> Frame:
-        """Returns the RGB-D frame at a pose. The same pose gives the same frame, noise included."""
+        """Renders the RGB-D frame at a pose. The same pose gives the same frame, noise included."""
         ...
 
 
@@ -89,7 +89,7 @@ class NoisySimulator:
         return self.simulator.start_pose
 
     def render(self, T_world_camera: np.ndarray | jax.Array) -> Frame:
-        """Returns the frame at a pose, with noise on its depth; 0 and inf keep their meaning."""
+        """Renders the frame at a pose, with noise on its depth; 0 and inf keep their meaning."""
         frame = self.simulator.render(np.asarray(T_world_camera))
         depth = np.asarray(frame.depth)
         noise = self._generator(frame).standard_normal(depth.shape, dtype=np.float32)
@@ -106,7 +106,7 @@ class NoisySimulator:
         )
 
     def _generator(self, frame: Frame) -> np.random.Generator:
-        """Returns the random numbers that depend on the seed and the frame's pose only."""
+        """Makes a generator that depends on the seed and the frame's pose only."""
         pose = np.asarray(frame.T_world_camera, dtype=np.float32) + np.float32(0.0)  # no -0
         digest = hashlib.sha256(pose.tobytes()).digest()
         return np.random.default_rng([self._seed, *np.frombuffer(digest, dtype=np.uint32)])

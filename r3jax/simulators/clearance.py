@@ -33,9 +33,9 @@ class SurfaceDistance:
         self._tree = KDTree(centers)
 
     def __call__(self, points: np.ndarray, limit: float = np.inf) -> np.ndarray:
-        """Returns distances [n] of `points` [n, 3] to the mesh [m].
+        """Measures the distances [n] of `points` [n, 3] to the mesh [m].
 
-        `inf` where beyond the limit.
+        They are `inf` beyond the limit.
         """
         points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
         found = np.full(len(points), np.inf)
@@ -50,7 +50,7 @@ class SurfaceDistance:
         return found
 
     def _measure(self, points: np.ndarray) -> np.ndarray:
-        """Returns distances [n] of `points` [n, 3] [m]."""
+        """Measures the distances [n] of `points` [n, 3] [m]."""
         k = min(_NEIGHBORS, len(self._pieces))
         reach, nearest = self._tree.query(points, k=k)
         reach, nearest = reach.reshape(len(points), k), nearest.reshape(len(points), k)
@@ -88,7 +88,7 @@ def cut_triangles(corners: np.ndarray, longest: float) -> np.ndarray:
 
 
 def point_triangle(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Returns the distance of each point [n, 3] to its triangle [n, 3, 3]."""
+    """Computes the distance of each point [n, 3] to its triangle [n, 3, 3]."""
     a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
     edges = [_point_segment(points, p, q) for p, q in ((a, b), (b, c), (c, a))]
     nearest = np.minimum(np.minimum(edges[0], edges[1]), edges[2])
@@ -104,7 +104,7 @@ def point_triangle(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def _point_segment(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Returns the distance of each point [n, 3] to its segment."""
+    """Computes the distance of each point [n, 3] to its segment."""
     along = b - a
     squared = np.einsum("ij,ij->i", along, along)
     share = np.einsum("ij,ij->i", points - a, along) / np.where(squared == 0.0, 1.0, squared)

@@ -78,7 +78,7 @@ class GroundTruth:
         return self._simulator.content_hash
 
     def free_positions(self, spacing: Sequence[float | int], margin: float | int) -> np.ndarray:
-        """Returns the lattice points that a camera can reach from the start.
+        """Finds the lattice points that a camera can reach from the start.
 
         The lattice begins half a spacing from the lower corner of the world's box. Under a
         start with a ceiling only points with a ceiling count: a path through an open window
@@ -133,7 +133,7 @@ class GroundTruth:
     def room_along(
         self, paths: Sequence[np.ndarray], limit: float = math.inf
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the least distances to a surface along paths, and where it is that.
+        """Measures the least distances to a surface along paths, and where they occur.
 
         Sampled every 2 cm. Glass that no depth sensor sees (`Material.is_hole`) does not count:
         no explorer can detect it.
@@ -177,7 +177,7 @@ class GroundTruth:
         return SurfaceDistance(world.vertices, faces), TriangleScene(world.vertices, faces)
 
     def _has_ceiling(self, points: np.ndarray) -> np.ndarray:
-        """Returns True where nearly all that is above a point is a surface, [n] bool."""
+        """Checks whether nearly all that is above a point is a surface, [n] bool."""
         up = fibonacci_lattice(96)
         up = up[up[:, 2] > 0.8]
         directions = np.broadcast_to(up, (len(points), *up.shape))
@@ -197,7 +197,7 @@ class GroundTruth:
         return TriangleScene(self._simulator.world.vertices, self._simulator.world.faces)
 
     def _free_nodes(self, nodes: "_Nodes", margin: float) -> np.ndarray:
-        """Returns which nodes keep the margin, [I, J, K] bool.
+        """Finds the nodes that keep the margin, [I, J, K] bool.
 
         Blocks of nodes are decided by bounds on their center's distance; those that are not are
         halved; single nodes that the bounds leave open are measured exactly.
@@ -242,7 +242,7 @@ class _Nodes:
 
 
 def _nodes(bounds: np.ndarray, spacing: np.ndarray, margin: float) -> _Nodes:
-    """Returns nodes that fill the box `bounds` [2, 3] [m]."""
+    """Fills the box `bounds` [2, 3] [m] with nodes."""
     finer = np.ceil(spacing / min(_STEP, margin) - 1e-9).astype(int)
     step = spacing / finer
     first = bounds[0] + 0.5 * spacing
@@ -260,12 +260,12 @@ def _nodes(bounds: np.ndarray, spacing: np.ndarray, margin: float) -> _Nodes:
 
 
 def _halved(blocks: np.ndarray) -> np.ndarray:
-    """Returns each block as eight."""
+    """Halves the blocks: each becomes eight."""
     return blocks.repeat(2, axis=0).repeat(2, axis=1).repeat(2, axis=2)
 
 
 def _reached(is_free: np.ndarray, nodes: _Nodes, start: np.ndarray) -> np.ndarray:
-    """Returns the free nodes that are connected to `start` [3] [m] face by face, [I, J, K] bool."""
+    """Finds the free nodes that are connected to `start` [3] [m] face by face, [I, J, K] bool."""
     index = np.argwhere(is_free)
     away = np.linalg.norm(nodes.low + index * nodes.step - start, axis=1)
     # The start lies between eight nodes; from the free ones of them nothing is in the way.
@@ -288,13 +288,13 @@ class _Surface:
         self._tree = KDTree(centers, balanced_tree=False)
 
     def bounds(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the least and greatest distance [n] that each of `points` [n, 3] may have [m]."""
+        """Bounds the distance of each of `points` [n, 3]: its least and greatest value [n] [m]."""
         to_center, nearest = self._tree.query(points)
         # No piece reaches farther from its center than the radius.
         return to_center - self._radius, point_triangle(points, self._pieces[nearest])
 
     def keeps(self, points: np.ndarray, margin: float) -> np.ndarray:
-        """Returns True where the distance is at least `margin` [m], exactly, [n] bool."""
+        """Checks whether the distance is at least `margin` [m], exactly, [n] bool."""
         kept = np.ones(len(points), dtype=bool)
         for begin in range(0, len(points), _CHUNK):
             chunk = points[begin : begin + _CHUNK]

@@ -497,7 +497,7 @@ def assumptions(world: World) -> list[str]:
 
 
 def world_from_file(path: Path, up: str | None = None) -> np.ndarray:
-    """Returns the rotation [3, 3] from a mesh file's axes to the z-up world.
+    """Computes the rotation [3, 3] from a mesh file's axes to the z-up world.
 
     Args:
         path: the file; it is not read.
@@ -513,7 +513,7 @@ def world_from_file(path: Path, up: str | None = None) -> np.ndarray:
 
 
 def scaled_turn(path: Path, up: str | None, scale: Any) -> np.ndarray:
-    """Returns `world_from_file` times the scale, [3, 3].
+    """Computes `world_from_file` times the scale, [3, 3].
 
     Raises:
         ValueError: `up` is no axis, or `scale` no positive number.
@@ -548,7 +548,7 @@ def _refuse_empty(path: Path, scene: Any) -> None:
 
 
 def _part_of(file: MeshFile, T: np.ndarray, name: str) -> _Part | None:
-    """Returns a mesh in its place, `T_world_node`; None for points, lines and empty meshes.
+    """Places a mesh by `T_world_node`; None for points, lines and empty meshes.
 
     Raises:
         ForeignFileError: faces that name no vertex, or a texture that cannot be read.
@@ -579,7 +579,7 @@ def _part_of(file: MeshFile, T: np.ndarray, name: str) -> _Part | None:
 def _appearance(
     file: MeshFile, mesh: Any, faces: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray | None, Material]:
-    """Returns the texture coordinates and colors per corner, and the material."""
+    """Reads the texture coordinates and colors per corner, and the material."""
     visual = mesh.visual
     no_uv = np.zeros((len(faces), 3, 2), np.float32)
     kind = getattr(visual, "kind", None)
@@ -603,7 +603,7 @@ def _appearance(
 
 
 def _material(file: MeshFile, source: Any, *, has_uv: bool) -> Material:
-    """Returns a trimesh material as ours. The texture keeps its size."""
+    """Converts a trimesh material to ours. The texture keeps its size."""
     if hasattr(source, "baseColorFactor"):
         image, factor = source.baseColorTexture, source.baseColorFactor
     else:

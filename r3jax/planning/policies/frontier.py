@@ -48,14 +48,14 @@ class Frontier(GreedyPolicy):
     source = "Yamauchi, CIRA 1997: the nearest frontier"
 
     def first_memory(self, camera: Camera, grid: OccupancyGrid) -> np.ndarray:
-        """Returns the frontier cells that were looked at on purpose, [X, Y, Z] bool: none."""
+        """Returns the frontier cells that were viewed on purpose, [X, Y, Z] bool: none."""
         del camera
         return np.zeros(grid.log_odds.shape, dtype=bool)
 
     def draw(self, situation: Situation, *, key: Array) -> Drawn:
-        """Returns views of the nearest frontier cells not looked at yet.
+        """Draws views of the nearest frontier cells that were not viewed yet.
 
-        If there is none, any nearby.
+        If there are none, any nearby views are drawn.
 
         The notes are True where views of the frontier were found.
         """
@@ -74,14 +74,14 @@ class Frontier(GreedyPolicy):
         return Drawn(candidates_along(stops, aims - stops).padded(num), attempted, notes=True)
 
     def score(self, situation: Situation, candidates: Candidates, *, key: Array) -> Scored:
-        """Returns the nothing: the path alone decides; lots where no frontier is in reach."""
+        """Leaves the choice to the path alone; random scores if no frontier is in reach."""
         lots = {} if situation.notes else draw_lots(len(candidates.valid), key=key)
         return candidates, lots
 
     def score_again(
         self, situation: Situation, candidates: Candidates, *, before: np.ndarray, key: Array
     ) -> Scored:
-        """Returns the their order stays: which cells they were drawn for is not known any more."""
+        """Keeps the order of the candidates: their target cells are no longer known."""
         del situation, key
         return candidates, {"lot": before}
 
@@ -96,7 +96,7 @@ class Frontier(GreedyPolicy):
         utilities: dict[str, np.ndarray],
         best: int,
     ) -> Any:
-        """Returns the cells that the chosen view of the frontier shows count as looked at."""
+        """Marks the cells as viewed that the chosen view of the frontier shows."""
         del utilities
         if not situation.notes:
             return situation.memory
@@ -109,7 +109,7 @@ class Frontier(GreedyPolicy):
 
 
 def _is_looked_at(centers: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray:
-    """Returns which cells a view shows, walls left aside: [X, Y, Z] bool."""
+    """Finds the cells that a view shows, ignoring walls, [X, Y, Z] bool."""
     offset = centers - T_world_camera[:3, 3]
     distance = np.linalg.norm(offset, axis=-1)
     along = offset @ T_world_camera[:3, 2]

@@ -34,7 +34,7 @@ class R3(GreedyPolicy):
     source = "Ours, arXiv 2601.07484"
 
     def score(self, situation: Situation, candidates: Candidates, *, key: Array) -> Scored:
-        """Returns U = lambda1 U_G + U_R of every view."""
+        """Computes U = lambda1 U_G + U_R of every view."""
         del key
         # On the masked grid: cells that no robot can look at would attract it forever.
         views = self.score_all(
@@ -63,12 +63,12 @@ class R3Pano(GreedyPolicy):
     source = "Ours-Pano, arXiv 2601.07484"
 
     def draw(self, situation: Situation, *, key: Array) -> Drawn:
-        """Returns positions of R3; their directions are not chosen yet."""
+        """Draws positions as R3 does; their directions are chosen later."""
         travel, grid = situation.travel, situation.scoring_grid
         return Drawn(random_places(travel, grid, self.config, key=key), situation.memory)
 
     def score(self, situation: Situation, candidates: Candidates, *, key: Array) -> Scored:
-        """Returns the score of every position's best allowed direction in its panorama."""
+        """Finds every position's best allowed direction in its panorama, and its score."""
         del key
         scoring, limits = self.config.scoring, situation.limits
         panorama = self.score_all(
@@ -91,7 +91,7 @@ def _refined(
     utilities: dict[str, np.ndarray],
     config: PlannerConfig,
 ) -> Scored:
-    """Returns the candidates, the best of which have climbed if the settings say so."""
+    """Refines the best candidates by gradient ascent if the settings say so."""
     if not config.refine:
         return candidates, utilities
     # A lazy import: jaxopt takes a second to load.

@@ -113,9 +113,9 @@ class R3Ahead(GreedyPolicy):
     Config = AheadConfig
 
     def draw(self, situation: Situation, *, key: Array) -> Drawn:
-        """Returns positions of `r3`, and some spread over all reachable space.
+        """Draws positions as `r3` does, and some spread over all reachable space.
 
-        No directions yet.
+        They have no directions yet.
         """
         travel = situation.travel
         num = self.config.num_candidates
@@ -137,9 +137,9 @@ class R3Ahead(GreedyPolicy):
         return Drawn(drawn.padded(num), situation.memory)
 
     def score(self, situation: Situation, candidates: Candidates, *, key: Array) -> Scored:
-        """Returns every position's best direction and its worth.
+        """Finds every position's best direction and its utility.
 
-        `ahead`, the rate of its best path.
+        `ahead` is the rate of the best path that begins there.
 
         A position from which no path of the beam begins has no rate: -inf.
         """
@@ -173,7 +173,7 @@ class R3Ahead(GreedyPolicy):
         return turned, {"utility": utility, "ahead": rate}
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
-        """Returns the rate of the best path: the path is in it."""
+        """Returns the rate of the best path, which already includes the path."""
         return utilities["ahead"]
 
 
@@ -241,7 +241,7 @@ class BeamProblem:
 
 
 def search(problem: BeamProblem) -> list[Path]:
-    """Returns the paths of the greatest rate, best first; none if no place can be reached."""
+    """Searches the paths of the greatest rate, best first; none if no place can be reached."""
     config = problem.config
     views = problem.views
     ways = problem.limits.path_costs(problem.lengths, views.direction)
@@ -271,7 +271,7 @@ def search(problem: BeamProblem) -> list[Path]:
 
 
 def lengths_between(travel: Travel, positions: np.ndarray) -> np.ndarray:
-    """Returns lengths of paths between positions [C, 3] that the robot can come to, [C, C] [m].
+    """Computes path lengths between positions [C, 3] that the robot can reach, [C, C] [m].
 
     Over straight lines between near ones, each safe throughout, or back past the robot: no
     shorter than the shortest way. Unreachable positions are infinitely far from all others.
@@ -295,7 +295,7 @@ def lengths_between(travel: Travel, positions: np.ndarray) -> np.ndarray:
 
 
 def _expanded(path: Path, problem: BeamProblem) -> list[Path]:
-    """Returns the path with one more view, once for each place that is tried."""
+    """Extends the path by one more view, once for each place that is tried."""
     config, last, views = problem.config, path.places[-1], problem.views
     (pose,) = poses_along(views.position[[last]], path.directions[-1][None])
     # Turns count from the last view of the path, not from where the robot is now.
@@ -336,7 +336,7 @@ def _expanded(path: Path, problem: BeamProblem) -> list[Path]:
 
 
 def _best(paths: list[Path], num: int) -> list[Path]:
-    """Returns the `num` paths of the greatest rate; of those through the same places, the first."""
+    """Selects the `num` paths of the greatest rate; of those through the same places, the first."""
     kept: dict[frozenset[tuple[int, bytes]], Path] = {}
     # The same views in another order know the same: only the fastest order is kept.
     for path in sorted(paths, key=lambda path: -path.rate):
@@ -367,7 +367,7 @@ def _apart(
 
 
 def _are_apart(views: Candidates, other: _Sight) -> np.ndarray:
-    """Returns which of the views are another choice than one view, [C]."""
+    """Finds the views that differ enough from one view to be another choice, [C]."""
     position, direction = other
     is_far = np.linalg.norm(views.position - position, axis=1) >= _APART
     # Directions have any length: a product on the other side saves dividing by it.

@@ -18,15 +18,15 @@ class Random(GreedyPolicy):
     source = "the floor of every comparison"
 
     def draw(self, situation: Situation, *, key: Array) -> Drawn:
-        """Returns the nearby positions, random directions."""
+        """Draws nearby positions and random directions."""
         num, radius = self.config.num_candidates, self.config.radius
         return Drawn(free_views(situation.travel, num, radius, key=key), situation.memory)
 
     def score(self, situation: Situation, candidates: Candidates, *, key: Array) -> Scored:
-        """Returns the lot that each candidate draws."""
+        """Draws a random score for each candidate."""
         del situation
         return candidates, draw_lots(len(candidates.valid), key=key)
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
-        """Returns the lot alone: paths cost nothing."""
+        """Returns the random scores alone: paths cost nothing."""
         return utilities["lot"]

@@ -52,7 +52,7 @@ def mask_unexplorable(
 
 
 def _grown(mask: np.ndarray) -> np.ndarray:
-    """Returns a mask and all face neighbors of its cells."""
+    """Grows a mask by all face neighbors of its cells."""
     grown = mask.copy()
     for axis in range(3):
         # Views, so that each axis is grown in place.

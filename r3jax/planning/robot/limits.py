@@ -42,16 +42,16 @@ class Limits:
         return Candidates(positions, directions, candidates.valid)
 
     def at_height(self, positions: np.ndarray) -> np.ndarray:
-        """Returns positions [..., 3] [m] at the nearest allowed height."""
+        """Moves positions [..., 3] [m] to the nearest allowed height."""
         allowed = np.array(positions)
         # Straight up or down is the shortest way back into a range of heights.
         allowed[..., 2] = np.clip(allowed[..., 2], *self.heights)
         return allowed
 
     def nearness(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Returns the cosine between each unit direction and the nearest one allowed; 1.
+        """Computes the cosine between each unit direction and the nearest one allowed.
 
-        It is allowed.
+        It is 1 for a direction that is allowed.
 
         Args:
             positions: [C, 1, 3] or [C, 3] [m].
@@ -77,9 +77,9 @@ class Limits:
         return nearness >= np.minimum(cap, nearness.max(axis=1, keepdims=True))
 
     def may_turn(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Returns where the path is long enough for the turn, elevation clipped.
+        """Checks whether the path is long enough for the turn, with the elevation clipped.
 
-        As `nearness` [bool].
+        Shapes are those of `nearness`, the result is bool.
         """
         # The elevation is clipped first: a tilt that stops short is no turn cut short.
         azimuth, elevation = self.clipped(*angles_along(directions))
@@ -102,9 +102,9 @@ class Limits:
         return lengths + self.motion.speed * seconds
 
     def seconds(self, length: float, direction: np.ndarray) -> float | None:
-        """Returns the time for a path of `length` [m] and a turn to a direction [3]; None.
+        """Computes the time for a path of `length` [m] and a turn to a direction [3] [s].
 
-        No speed is set.
+        It is None if no speed is set.
         """
         return self.motion.seconds(length, float(self.turns(direction[None])[0]))
 
@@ -117,7 +117,7 @@ class Limits:
     def _turned(
         self, positions: np.ndarray, azimuth: np.ndarray, elevation: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the nearest angles that are allowed at positions [..., 3].
+        """Finds the nearest angles that are allowed at positions [..., 3].
 
         A turn by both angles is no longer than the root of the sum of their squares: the axes of
         azimuth and elevation are at right angles to each other.
@@ -141,7 +141,7 @@ class Limits:
         return azimuth_now + share * by[0], elevation_now + share * by[1]
 
     def clipped(self, azimuth: np.ndarray, elevation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns angles [rad] whose elevation is allowed."""
+        """Clips the elevation of angles [rad] to the allowed range."""
         return azimuth, np.clip(elevation, *np.radians(self.motion.elevations))
 
 
@@ -150,7 +150,7 @@ UNBOUND = Limits()
 
 
 def begin_at(motion: Motion, T_world_camera: np.ndarray) -> np.ndarray:
-    """Returns the pose where a mission begins, [4, 4]: its elevation becomes one that is allowed.
+    """Clips the elevation of the pose where a mission begins, [4, 4].
 
     Raises:
         ValueError: the robot cannot be at that height.
@@ -168,7 +168,7 @@ def begin_at(motion: Motion, T_world_camera: np.ndarray) -> np.ndarray:
 
 
 def angles_of(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the azimuth and elevation [rad] of poses [C, 4, 4] without roll, [C] each.
+    """Computes azimuth and elevation [rad] of poses [C, 4, 4] without roll, [C] each.
 
     The azimuth is read off the level axis of the image: it means something straight up, too.
     """
@@ -187,13 +187,13 @@ def angles_along(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def directions_along(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
-    """Returns the unit vectors along azimuths and elevations [...] [rad], [..., 3]."""
+    """Computes unit vectors along azimuths and elevations [...] [rad], [..., 3]."""
     level = np.cos(elevation)
     return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
 
 
 def rotations(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
-    """Returns axes of the cameras that look there without roll, [C, 3, 3]."""
+    """Computes the axes of cameras without roll that look there, [C, 3, 3]."""
     forward = directions_along(azimuth, elevation)
     # From the azimuth: a cross product with the vertical vanishes straight up and down.
     right = np.stack([np.sin(azimuth), -np.cos(azimuth), np.zeros_like(azimuth)], axis=-1)
@@ -201,7 +201,7 @@ def rotations(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
 
 
 def _angle_of_turn(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
-    """Returns the angle of the rotation that changes azimuth and elevation by so much [rad].
+    """Computes the angle of a rotation from its change of azimuth and elevation [rad].
 
     The real part of the product of the two rotations' quaternions: their axes are at right angles
     to each other, so that nothing else enters it.
@@ -211,12 +211,12 @@ def _angle_of_turn(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
 
 
 def wrapped(angle: np.ndarray) -> np.ndarray:
-    """Returns angles [rad] as turns by at most half a circle."""
+    """Wraps angles [rad] to turns by at most half a circle."""
     return np.asarray(np.pi - np.mod(np.pi - angle, 2.0 * np.pi))
 
 
 def _distance(
     first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.ndarray]
 ) -> np.ndarray:
-    """Returns the between pairs of azimuth and elevation [rad]."""
+    """Computes the distance between pairs of azimuth and elevation [rad]."""
     return np.hypot(wrapped(second[0] - first[0]), second[1] - first[1])

@@ -119,16 +119,16 @@ class Motion:
         return base + self.heights[0], base + self.heights[1]
 
     def seconds(self, length: float, angle: float) -> float | None:
-        """Returns the time for a way of `length` [m] and a turn by `angle` [rad]; None.
+        """Computes the time for a path of `length` [m] and a turn by `angle` [rad] [s].
 
-        The motion has none.
+        It is None if the motion has no speed.
         """
         if self.speed is None:
             return None
         return length / self.speed + self.turning(angle)
 
     def turning(self, angle: float) -> float:
-        """Returns the time for a turn by `angle` [rad] alone [s]."""
+        """Computes the time for a turn by `angle` [rad] alone [s]."""
         return 0.0 if self.turn_rate is None else math.degrees(angle) / self.turn_rate
 
 
@@ -149,7 +149,7 @@ height where it starts; a drone whose gimbal cannot look up far; a person who wa
 
 
 def make_motion(name: str = "free", **changes: Any) -> Motion:
-    """Returns a motion by name, with other values for some of its fields.
+    """Makes a motion by name, with other values for some of its fields.
 
     Raises:
         ValueError: no motion has that name, it has no such field, or a value cannot work.
@@ -180,7 +180,7 @@ def check_height(height: float, heights: tuple[float, float]) -> None:
 
 
 def motion_of_record(record: Any) -> Motion:
-    """Returns a motion from what JSON holds of it; None, where nothing was written: a free camera.
+    """Reads a motion from a JSON object; None, from old records, means a free camera.
 
     Raises:
         ValueError: an unknown field, a value of another kind, or one that cannot work.

@@ -99,7 +99,7 @@ class Travel:
         return all(0 <= i < n for i, n in zip(cell, self.usable.shape, strict=True))
 
     def cell_of(self, position: np.ndarray) -> tuple[int, int, int]:
-        """Returns the cell that holds a position [m]; it may lie outside the grid."""
+        """Finds the cell that holds a position [m]; it may lie outside the grid."""
         # float64 throughout: float32 would put points on a border into either cell.
         x, y, z = np.floor((np.asarray(position, np.float64) - self.origin) / self.cell_size)
         return int(x), int(y), int(z)
@@ -109,9 +109,9 @@ class Travel:
         return self.origin + (np.asarray(cells) + 0.5) * self.cell_size
 
     def stops(self, cells: np.ndarray) -> np.ndarray:
-        """Returns where the camera stands in cells given by index, [n, 3] [m].
+        """Computes where the camera stands in cells given by index, [n, 3] [m].
 
-        At an allowed height.
+        It stands at an allowed height.
         """
         places = self.centers(cells)
         if self.room is not None:
@@ -124,9 +124,9 @@ class Travel:
         return places
 
     def distance(self, cell: np.ndarray | tuple[int, int, int]) -> float:
-        """Returns the length of the path from the robot to its stop in a cell [m].
+        """Computes the length of the path from the robot to its stop in a cell [m].
 
-        Inf if there is none.
+        It is inf if there is no path.
         """
         x, y, z = (int(i) for i in np.asarray(cell))
         if not self.contains((x, y, z)):
@@ -135,7 +135,7 @@ class Travel:
         return float(np.linalg.norm(first - self.start) + self.cost[x, y, z])
 
     def lengths(self, positions: np.ndarray) -> np.ndarray:
-        """Returns the path lengths [m] to positions [n, 3]; inf where there is no way.
+        """Computes path lengths [m] to positions [n, 3]; inf where there is no path.
 
         The straight line where it is safe, else the path over the cells' centers: no shorter
         than what `path` returns.
@@ -250,7 +250,7 @@ def plan_travel(
     body: float = 0.0,
     room: Room | None = None,
 ) -> Travel:
-    """Returns the shortest paths from a position to everywhere that is safe. Once per decision.
+    """Plans shortest paths from a position to all safe places. Once per decision.
 
     Args:
         grid: what is known.
@@ -324,7 +324,7 @@ def plan_travel(
 
 
 def safe_cells(free: np.ndarray, cell_size: float, margin: float) -> np.ndarray:
-    """Returns cells round whose center a ball of radius `margin` [m] touches free cells only.
+    """Finds cells round whose center a ball of radius `margin` [m] touches free cells only.
 
     Args:
         free: cells known to be free, [X, Y, Z] bool; beyond the array nothing is.
@@ -348,7 +348,7 @@ def safe_cells(free: np.ndarray, cell_size: float, margin: float) -> np.ndarray:
 
 
 def segment_is_inside(mask: np.ndarray, a: np.ndarray, b: np.ndarray) -> bool:
-    """Returns True if a segment runs through cells of the mask only, corners it touches included.
+    """Checks whether a segment lies in cells of the mask only, touched corners included.
 
     Args:
         mask: [X, Y, Z] bool; beyond the array nothing is in the mask.
@@ -364,7 +364,7 @@ def segment_is_inside(mask: np.ndarray, a: np.ndarray, b: np.ndarray) -> bool:
 def layers_between(
     heights: tuple[float, float], origin: float, cell_size: float, num: int
 ) -> tuple[int, int]:
-    """Returns the first and the last layer of cells that hold heights [m] out of a range.
+    """Finds the first and the last layer of cells that hold heights [m] out of a range.
 
     Args:
         heights: lowest and highest, either may be infinite.
@@ -385,7 +385,7 @@ def cells_over_matter(
     origin: float,
     cell_size: float,
 ) -> np.ndarray:
-    """Returns cells in which a camera on a body would have something known inside the body.
+    """Finds cells in which the body below the camera would overlap something known.
 
     The body is a cylinder below the camera, as wide as the safety margin; of a cell the lowest
     allowed height counts. What is unknown is open: a camera that looks ahead never sees the floor

@@ -159,7 +159,7 @@ class HabitatSimulator:
         return hashlib.sha256(f"{who} {self._mesh.world.content_hash}".encode()).hexdigest()
 
     def render(self, T_world_camera: np.ndarray | jax.Array) -> Frame:
-        """Returns the RGB-D frame at a pose [4, 4].
+        """Renders the RGB-D frame at a pose [4, 4].
 
         Depth is 0 where Habitat finds no surface, and inf beyond `max_range`.
 
@@ -179,7 +179,7 @@ class HabitatSimulator:
         )
 
     def _observe(self, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns bytes [H, W, 3] and depth without limit [H, W] at a pose [4, 4]."""
+        """Renders bytes [H, W, 3] and depth without limit [H, W] at a pose [4, 4]."""
         try:
             position, rotation = agent_from_pose(T, self._habitat_from_world)
         except ValueError as error:
@@ -351,7 +351,7 @@ def default_gpu_device() -> int:
 
 
 def _import_habitat() -> tuple[Any, Any, Any]:
-    """Returns the modules `habitat_sim`, `magnum` and `quaternion` that come with it."""
+    """Imports `habitat_sim`, and the modules `magnum` and `quaternion` that come with it."""
     for name in ("MAGNUM_LOG", "HABITAT_SIM_LOG"):
         os.environ.setdefault(name, "quiet")  # read once, on import
     try:

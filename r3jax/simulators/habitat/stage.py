@@ -79,7 +79,7 @@ def read_stage(path: str | Path) -> HabitatStage:
 
 
 def _read_config(path: Path) -> HabitatStage:
-    """Returns a stage config's mesh and axes."""
+    """Reads a stage config's mesh and axes."""
     config = parse_json(read_bytes(path, _MAX_CONFIG))
     check_type("the stage config", config, dict[str, Any])
     if "render_asset" not in config:
@@ -101,7 +101,7 @@ def _read_config(path: Path) -> HabitatStage:
 
 
 def _axes_of(config: dict[str, Any]) -> np.ndarray:
-    """Returns the rotation [3, 3] that a stage config's `up` and `front` ask for."""
+    """Computes the rotation [3, 3] for the `up` and `front` of a stage config."""
     lacking = [name for name in ("up", "front") if name not in config]
     if lacking:
         raise ForeignFileError(
@@ -127,7 +127,7 @@ _MAX_STRETCH = 1e-5
 
 
 def habitat_from_axes(up: Sequence[float | int], front: Sequence[float | int]) -> np.ndarray:
-    """Returns the rotation [3, 3] from a mesh file to Habitat's world.
+    """Computes the rotation [3, 3] from a mesh file to Habitat's world.
 
     Args:
         up: direction in the file that becomes Habitat's up, +y; a stage config's `up`.
@@ -156,7 +156,7 @@ BARE_GLB = habitat_from_axes((0, 0, 1), (0, 1, 0))
 def agent_from_pose(
     T_world_camera: np.ndarray, habitat_from_world: np.ndarray
 ) -> tuple[np.ndarray, Rotation]:
-    """Returns the state of an agent whose camera sits in its origin.
+    """Computes the state of an agent whose camera sits in its origin.
 
     Args:
         T_world_camera: pose of the camera in our world, [4, 4].
@@ -178,7 +178,7 @@ def agent_from_pose(
 
 
 def horizontal_fov_deg(camera: Camera) -> float:
-    """Returns the horizontal field of view [deg] by which Habitat knows a camera.
+    """Computes the horizontal field of view [deg] by which Habitat knows a camera.
 
     Raises:
         ValueError: Habitat cannot show this camera's image: its pixels are not square, or the

@@ -45,9 +45,9 @@ _PACKETS_PER_BLOCK = 16
 
 @functools.cache
 def library() -> CDLL | None:
-    """Returns the version 4 of embree as `embreex` brings it.
+    """Loads version 4 of embree, which `embreex` contains.
 
-    None where the package holds no such library.
+    It is None if the package contains no such library.
     """
     import embreex
 

@@ -134,14 +134,14 @@ class RaycastSimulator:
         return other
 
     def clearance(self, points: np.ndarray) -> np.ndarray:
-        """Returns distances [n] of `points` [n, 3] to the mesh [m]. For tests.
+        """Measures the distances [n] of `points` [n, 3] to the mesh [m].
 
-        The loop never has it.
+        For tests only: the exploration loop never has them.
         """
         return self._distance(np.asarray(points, dtype=np.float64))
 
     def segment_is_clear(self, a: np.ndarray, b: np.ndarray) -> bool:
-        """Returns True if no surface lies between the points `a` and `b` [3] [m]."""
+        """Checks that no surface lies between the points `a` and `b` [3] [m]."""
         a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
         if np.array_equal(a, b):
             return True
@@ -149,7 +149,7 @@ class RaycastSimulator:
         return bool(hits.distance[0] > 1.0)
 
     def render(self, T_world_camera: np.ndarray | jax.Array) -> Frame:
-        """Returns the RGB-D frame at a pose [4, 4].
+        """Renders the RGB-D frame at a pose [4, 4].
 
         Depth is 0 on surfaces that the sensor fails on (`Material.is_hole`), and inf where no
         surface lies within `max_range`.
@@ -195,9 +195,9 @@ class RaycastSimulator:
         return np.ascontiguousarray(grid.reshape(-1, 3), dtype=np.float32)
 
     def _given_start(self, start_pose: np.ndarray | None) -> np.ndarray | None:
-        """Returns the start that the caller or the world asks for, checked; None.
+        """Checks the start that the caller or the world sets.
 
-        Search for one.
+        None means that one must be searched.
         """
         if start_pose is not None:
             pose = np.array(start_pose, dtype=np.float64)
@@ -249,7 +249,7 @@ class RaycastSimulator:
         directions: np.ndarray,
         steps: np.ndarray,
     ) -> np.ndarray:
-        """Returns what the mirrors hit by `rays` (indices) show, one bounce deep, [n, 3]."""
+        """Shades what the mirrors hit by `rays` (indices) show, one bounce deep, [n, 3]."""
         from r3jax.simulators.raycast.shading import shade
 
         normal = self._face_normals[hits.face[rays]]

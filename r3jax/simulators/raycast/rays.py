@@ -68,7 +68,7 @@ class TriangleScene:
         cull_back_faces: bool = False,
         neighbors: bool = False,
     ) -> Hits:
-        """Returns the first hits of rays.
+        """Casts rays, and finds their first hits.
 
         Args:
             origins: [n, 3], or [1, 3] if all start there [m].

@@ -69,7 +69,7 @@ def _turn_all(directions, rotation, workers, there):
 
 
 def inside(directions: np.ndarray, pixels: np.ndarray, shifts: np.ndarray) -> np.ndarray:
-    """Returns directions of the rays inside pixels, [m S, 3]: those of a pixel follow each other.
+    """Computes directions of the rays inside pixels, [m S, 3], those of a pixel together.
 
     Args:
         directions: of the rays through the centers of all pixels [n, 3].
@@ -120,7 +120,7 @@ def _average_all(image, pixels, colors, workers):
 
 @inlined
 def _differ(image, face, row, column, next_row, next_column):
-    """Returns True if two pixels show different faces in different colors."""
+    """Checks whether two pixels show different faces in different colors."""
     if face[row, column] == face[next_row, next_column]:
         return False
     contrast = np.float32(0.0)
@@ -172,28 +172,28 @@ _LANES = 16
 
 @inlined_fused
 def dot(a, b):
-    """Returns the scalar product of two vectors, fused in one order.
+    """Computes the scalar product of two vectors, fused in one order.
 
-    The same bits wherever it is inlined.
+    The bits are the same wherever it is inlined.
     """
     return fused(a[2], b[2], fused(a[0], b[0], a[1] * b[1]))
 
 
 @inlined_fused
 def dot_in_turn(a, b):
-    """Returns the same from the first coordinate on: where images have always had it so."""
+    """Computes `dot` from the first coordinate on, the order that images have always had."""
     return fused(a[2], b[2], fused(a[1], b[1], a[0] * b[0]))
 
 
 @inlined_fused
 def three(column, begin, i):
-    """Returns a vector in three columns that follow each other."""
+    """Reads a vector from three columns that follow each other."""
     return column[begin + i], column[begin + BLOCK + i], column[begin + 2 * BLOCK + i]
 
 
 @inlined_fused
 def _moved(step, mirror, normal, per_along, direction, path, gradients):
-    """Returns how far, in texels, a hit moves when the pixel moves by one column or row.
+    """Computes by how many texels a hit moves when the pixel moves by one column or row.
 
     With the plane's normal n and direction d, a change e of the direction moves the hit by
     t (e - d (n e) / (n d)) (Igehy, "Tracing ray differentials", 1999). A mirror reflects e.
@@ -237,7 +237,7 @@ def _measure(floats, steps, num):
 
 @inlined_fused
 def _wrapped(first, size):
-    """Returns the texel, 0 to size - 1, that a texture which repeats shows at a whole number."""
+    """Wraps a whole number to a texel, 0 to size - 1, of a texture that repeats."""
     number, length = np.float32(first), np.float32(size)
     # Remainders of vectors are taken in floats; one step mends what rounding has spoiled.
     at = np.int32(first - np.int32(whole(floor(number / length)) * size))
@@ -248,7 +248,7 @@ def _wrapped(first, size):
 
 @inlined_fused
 def _pair(x, size):
-    """Returns the two texels next to x of a texture that repeats, and the second one's weight."""
+    """Finds the two texels next to x of a texture that repeats, and the second one's weight."""
     low = floor(x)
     first = _wrapped(whole(low), size)
     second = np.int32(first + 1)
@@ -554,7 +554,7 @@ def shade(
     path_before: np.ndarray | None = None,
     mirror: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Returns colors of hits in [0, 1], black where nothing was hit, [n, 3] float32.
+    """Computes the colors of hits in [0, 1], black where nothing was hit, [n, 3] float32.
 
     Args:
         tables: the world's tables.

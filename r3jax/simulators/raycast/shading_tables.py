@@ -102,7 +102,7 @@ def _halve(texels: np.ndarray, halved: np.ndarray) -> None:
 
 
 def _mean_of_four(texels: np.ndarray, half: int) -> np.ndarray:
-    """Returns sums of 2x2 numbers, rounded by `half` of four and divided by four."""
+    """Sums 2x2 numbers, rounded by `half` of four, and divides by four."""
     rows = texels[0::2] + texels[1::2]
     return (rows[:, 0::2] + rows[:, 1::2] + np.uint32(half)) >> 2
 
@@ -170,7 +170,7 @@ def build_shading_tables(world: World, *, lighting: bool) -> ShadingTables:
 
 
 def _unique_textures(world: World) -> tuple[list[np.ndarray], list[int]]:
-    """Returns the distinct images, and each material's index into them (-1: none)."""
+    """Collects the distinct images, and each material's index into them (-1: none)."""
     images: list[np.ndarray] = []
     index: dict[bytes, int] = {}
     texture_of: list[int] = []
@@ -188,7 +188,7 @@ def _unique_textures(world: World) -> tuple[list[np.ndarray], list[int]]:
 
 
 def _face_table(world: World, material_size: np.ndarray) -> np.ndarray:
-    """Returns `ShadingTables.faces`, [F, 16] float64."""
+    """Fills `ShadingTables.faces`, [F, 16] float64."""
     corners = world.vertices[world.faces]
     edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     cross = np.cross(edge1, edge2)

@@ -17,7 +17,7 @@ MESH_SUFFIXES = (".glb", ".gltf", ".ply", ".obj")
 
 
 def outside_scenes() -> dict[str, str]:
-    """Returns how to name scenes that are not embedded, each with a line about them."""
+    """Lists how to name scenes that are not embedded, each with a line about them."""
     return {
         "mesh:<file>": "any GLB, glTF, PLY or OBJ file",
         "replica:<name>": "hotel0, office0 to office4, room0 to room2 of the Replica dataset; "
@@ -29,7 +29,7 @@ def outside_scenes() -> dict[str, str]:
 
 
 def split_name(spec: str) -> tuple[str, str]:
-    """Returns what opens a scene (a key of `OUTSIDE`, or "embedded"), and its name or file there.
+    """Splits a scene's name into its kind (a key of `OUTSIDE`, or "embedded") and the rest.
 
     Raises:
         ValueError: the scene is unknown; names the known ones, and the one that was meant.
@@ -83,7 +83,7 @@ def check_scene(spec: str, scale: float | int = 1.0) -> None:
 
 
 def habitat_file(rest: str) -> Path:
-    """Returns the file that Habitat loads for what follows `habitat:`.
+    """Finds the file that Habitat loads for the part after `habitat:`.
 
     Raises:
         ValueError: neither a file nor a scene of Replica; lists these.

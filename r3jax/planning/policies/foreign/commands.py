@@ -11,7 +11,7 @@ COMMAND = "exec:"
 
 
 def words_of(command: str) -> list[str]:
-    """Returns the program and arguments of a command, split as a shell does.
+    """Splits a command into its program and arguments, as a shell does.
 
     Raises:
         ValueError: there is no such program, or a quotation mark is open.
@@ -31,9 +31,9 @@ def words_of(command: str) -> list[str]:
 
 
 def short_name(name: str) -> str:
-    """Returns what folders call a policy.
+    """Returns the name of a policy in folders.
 
-    The class of `package.module:Class`, the script of a command.
+    It is the class of `package.module:Class`, or the script of a command.
     """
     if not name.startswith(COMMAND):
         return name.rpartition(":")[2]

@@ -136,7 +136,7 @@ class Foreign:
         return initial_state(camera, grid, memory, self.config.motion)
 
     def _hello(self, camera: Camera, grid: OccupancyGrid, key: Array) -> Message:
-        """Returns everything that holds for the whole run."""
+        """Builds the message with all that holds for the whole run."""
         origin, size = np.asarray(grid.origin, np.float64), float(grid.cell_size)
         far = origin + size * np.asarray(grid.log_odds.shape)
         lens = {name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")}
@@ -171,7 +171,7 @@ class Foreign:
         *,
         key: Array,
     ) -> tuple[Decision | None, PlannerState, PlanInfo]:
-        """Returns the view that the program chooses, and the path to it.
+        """Lets the program choose a view, and plans the path to it.
 
         Raises:
             PolicyError: no answer, or one that cannot be taken; the program has ended then.
@@ -185,7 +185,7 @@ class Foreign:
         return Drawn(random_views(travel, grid, self.config, key=key), situation.memory)
 
     def _ask(self, situation: Situation, candidates: Candidates, *, key: Array) -> Scored:
-        """Returns what is on offer, with utility 1 for the view that the program chooses, else 0.
+        """Offers the candidates; the utility is 1 for the view that the program chooses, else 0.
 
         Raises:
             PolicyError: no answer, or one that cannot be taken.
@@ -217,7 +217,7 @@ class Foreign:
         T_world_camera: np.ndarray,
         waypoints: np.ndarray,
     ) -> PlannerState:
-        """Returns the cells on the path; the program is told of frames alone."""
+        """Records the cells on the path; the program receives frames only."""
         state, situation = look_round(state, map_state, grid, T_world_camera, self.config)
         return with_path(state, situation.travel, waypoints)
 
@@ -265,24 +265,24 @@ class Foreign:
         return answer
 
     def _refused(self, session: _Session, reason: str) -> PolicyError:
-        """Returns an error for an answer that cannot be taken; the program is ended."""
+        """Ends the program, and returns an error for its unusable answer."""
         session.program.close()
         return PolicyError(f"the program {self.config.command!r} {reason}")
 
 
 def _seed(key: Array) -> int:
-    """Returns a number that follows from a key, for whatever random numbers a program draws."""
+    """Derives a seed from a key, for the random numbers of a program."""
     return int(host_generator(key).integers(1 << 31))
 
 
 def _costs(candidates: Candidates, situation: Situation) -> np.ndarray:
-    """Returns costs of the paths to views, turns included, [C] [m]."""
+    """Computes the costs of the paths to views, turns included, [C] [m]."""
     lengths = path_lengths(situation.travel, candidates)
     return situation.limits.path_costs(lengths, candidates.direction)
 
 
 def _images(frames: list[Frame]) -> dict[str, np.ndarray]:
-    """Returns frames as arrays: color [n, H, W, 3], depth [n, H, W] [m], poses [n, 4, 4]."""
+    """Stacks frames in arrays: color [n, H, W, 3], depth [n, H, W] [m], poses [n, 4, 4]."""
     if not frames:
         return {}
     stacked = lambda name: np.stack([np.asarray(getattr(f, name), np.float32) for f in frames])
@@ -294,7 +294,7 @@ def _images(frames: list[Frame]) -> dict[str, np.ndarray]:
 
 
 def _shown(situation: Situation, offered: Candidates) -> dict[str, np.ndarray]:
-    """Returns where the camera is, the views on offer, and the space as it is known."""
+    """Collects the camera's pose, the views on offer, and the known space."""
     free, occupied = np.asarray(situation.grid.free), np.asarray(situation.grid.occupied)
     travel = situation.travel
     return {
@@ -324,7 +324,7 @@ def _check_view(answer: Message, seen: int) -> None:
 def _view_of(
     answer: Message, offered: Candidates, situation: Situation
 ) -> tuple[Candidates, int] | None:
-    """Returns the views on offer, that of the program among them, and its number; None: no view.
+    """Adds the program's view to those on offer, and finds its number; None: no view.
 
     Raises:
         ForeignFileError: the answer is none, or names a view that cannot be taken; says why.
@@ -361,7 +361,7 @@ def _view_of(
 
 
 def _point(answer: Message, name: str) -> np.ndarray:
-    """Returns three finite numbers of an answer; a direction has a length.
+    """Reads three finite numbers of an answer; a direction must have a length.
 
     Raises:
         ForeignFileError: they are not there.

@@ -50,7 +50,7 @@ class Message:
 
 
 def encode(message: Message) -> bytes:
-    """Returns the bytes of a message.
+    """Encodes a message in bytes.
 
     Raises:
         ValueError: numbers that JSON does not know, arrays of a kind that is not sent, or too
@@ -91,7 +91,7 @@ def length_of(prefix: bytes) -> int:
 
 
 def decode(data: bytes) -> Message:
-    """Returns the answer that bytes are: inverse of `encode` for a message without arrays.
+    """Decodes the answer in bytes: inverse of `encode` for a message without arrays.
 
     Raises:
         MessageError: they are none; says why.

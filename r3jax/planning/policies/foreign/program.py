@@ -166,7 +166,7 @@ class Program:
         return bool(said)
 
     def _death(self, closed: str) -> str:
-        """Returns how the program ended, or what it closed instead: its `input` or its `output`."""
+        """Describes how the program ended, or that it only closed its `input` or `output`."""
         code = _wait(self._process)
         assert self._process.stderr is not None
         with contextlib.suppress(BlockingIOError):
@@ -180,7 +180,7 @@ class Program:
 
 
 def _is_whole(inbox: bytearray, asked: bool) -> bool:
-    """Returns whether a message has come; `asked`: the question is sent to its end.
+    """Checks whether a message has arrived whole; `asked`: the question has been sent.
 
     Raises:
         MessageError: too long, more than one, or before the question.
@@ -253,7 +253,7 @@ def _limit_memory(pid: int, memory: int) -> None:
 
 
 def _family(pid: int) -> list[psutil.Process]:
-    """Returns a process and all that descend from it."""
+    """Lists a process and all its descendants."""
     with contextlib.suppress(psutil.Error):
         program = psutil.Process(pid)
         return [program, *program.children(recursive=True)]
@@ -261,7 +261,7 @@ def _family(pid: int) -> list[psutil.Process]:
 
 
 def _size(process: psutil.Process, *, divided: bool = False) -> int:
-    """Returns the memory of a process [bytes]; `divided`: of shared pages its part."""
+    """Measures the memory of a process [bytes]; `divided`: with its part of shared pages."""
     with contextlib.suppress(psutil.Error):
         return int(process.memory_full_info().pss if divided else process.memory_info().rss)
     return 0

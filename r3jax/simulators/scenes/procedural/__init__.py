@@ -29,7 +29,7 @@ _SCENES = {
 
 
 def names() -> tuple[str, ...]:
-    """Returns the nine names, from the demo's scene on."""
+    """Lists the nine names, from the demo's scene on."""
     return tuple(_SCENES)
 
 
@@ -62,7 +62,7 @@ def rooms(name: str) -> dict[str, tuple[float, float, float, float]]:
 
 
 def describe(name: str) -> str:
-    """Returns one line about the scene of that name.
+    """Describes the scene of that name in one line.
 
     Raises:
         ValueError: no scene has that name.
