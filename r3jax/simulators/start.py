@@ -28,7 +28,7 @@ _SMALLEST_ROOM = 10.0
 
 
 def level_pose(position: np.ndarray, yaw: float) -> np.ndarray:
-    """Returns the pose at `position` [3] [m] that looks level along `yaw` [rad], [4, 4] float64."""
+    """Makes the pose at `position` [3] [m] that looks level along `yaw` [rad], [4, 4] float64."""
     cos, sin = math.cos(yaw), math.sin(yaw)
     pose = np.eye(4)
     pose[:3, 0] = sin, -cos, 0.0
@@ -75,9 +75,9 @@ def start_problem(
 def find_start(
     bounds: np.ndarray, scene: TriangleScene, distance: SurfaceDistance, seed: int = 0
 ) -> np.ndarray | None:
-    """Returns the roomiest place at eye height.
+    """Finds the roomiest place at eye height, as a pose [4, 4].
 
-    A pose [4, 4], or None where nothing is free enough.
+    It is None if nothing is free enough.
 
     Candidates stand 1.4 m above whatever is below a random point (lower under a low ceiling).
     Best are places with walls and a ceiling all round whose faces are seen from the front; then
@@ -145,7 +145,7 @@ def _enclosure(points: np.ndarray, scene: TriangleScene) -> tuple[np.ndarray, np
 
 
 def _longest_view(position: np.ndarray, scene: TriangleScene) -> float:
-    """Returns the yaw [rad] along which a wide view reaches farthest."""
+    """Finds the yaw [rad] along which a wide view reaches farthest."""
     yaw = np.linspace(-np.pi, np.pi, 72, endpoint=False)
     level = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=1)
     reach = np.minimum(_cast(scene, position[None], level).distance, 10.0)
@@ -154,7 +154,7 @@ def _longest_view(position: np.ndarray, scene: TriangleScene) -> float:
 
 
 def _is_inside_furniture(position: np.ndarray, bounds: np.ndarray, scene: TriangleScene) -> bool:
-    """Returns True inside a closed solid that is too small for a room.
+    """Checks whether a place lies inside a closed solid that is too small for a room.
 
     Many meshes have their faces the wrong way round, and a room may be a box seen from within:
     so only a small shell that shows nothing but back faces, with a world outside it, counts.

@@ -10,7 +10,7 @@ from r3jax.kernels.constants import SH0, SH1, SH2, SH3
 def harmonics(
     x: Float[Array, " n"], y: Float[Array, " n"], z: Float[Array, " n"], degree: int
 ) -> list[Float[Array, " n"]]:
-    """Returns the basis functions at unit directions (x, y, z), (degree + 1)^2 of them."""
+    """Computes the (degree + 1)^2 basis functions at unit directions (x, y, z)."""
     basis = [jnp.full_like(x, SH0)]
     if degree >= 1:
         basis += [-SH1 * y, SH1 * z, -SH1 * x]
@@ -39,7 +39,7 @@ def harmonics(
 def view_colors(
     sh: Float[Array, "n k 3"], means: Float[Array, "n 3"], camera_center: Float[Array, " 3"]
 ) -> Float[Array, "3 n"]:
-    """Returns colors of Gaussians as a camera sees them: max(SH(direction) + 0.5, 0).
+    """Computes colors of Gaussians as a camera sees them: max(SH(direction) + 0.5, 0).
 
     Args:
         sh: coefficients, k = (degree + 1)^2.
@@ -60,7 +60,7 @@ def view_colors(
 def _sum_harmonics(
     sh: Float[Array, "n k 3"], x: Float[Array, " n"], y: Float[Array, " n"], z: Float[Array, " n"]
 ) -> Float[Array, "3 n"]:
-    """Returns the sum of coefficient x basis at unit directions, for each channel."""
+    """Sums coefficient x basis at unit directions, for each channel."""
     basis = harmonics(x, y, z, _degree(sh))
     return jnp.stack([sum(b * sh[:, i, c] for i, b in enumerate(basis)) for c in range(3)])
 

@@ -113,9 +113,9 @@ def find_model(
 
 
 def newest_name(models: Path) -> str | None:
-    """Returns names the model that is meant without a name.
+    """Finds the model that is meant without a name.
 
-    `last`, or else the newest, or else none.
+    It is `last`, or else the newest, or else None.
     """
     found = sorted(models.glob("*/scene.ply"), key=lambda path: path.stat().st_mtime)
     names = [path.parent.name for path in found]
@@ -123,7 +123,7 @@ def newest_name(models: Path) -> str | None:
 
 
 def _read_record(path: Path) -> dict[str, Any]:
-    """Returns train.json, with what is used of it checked.
+    """Reads train.json, and checks the fields that are used.
 
     Raises:
         ForeignFileError: it is damaged.

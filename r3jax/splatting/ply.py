@@ -142,7 +142,7 @@ def read_scene(path: Path | str) -> GaussianScene:
 
 
 def _scene_fields(num_rest: int) -> list[str]:
-    """Returns names of the columns in the order of the original program."""
+    """Lists the columns in the order of the original program."""
     rest = [f"f_rest_{i}" for i in range(num_rest)]
     return [*_POSITION, *_NORMAL, *_DC, *rest, "opacity", *_SCALE, *_ROTATION]
 
@@ -165,7 +165,7 @@ def _check_hash(file: BinaryIO) -> None:
 
 
 def _read_header(path: Path, file: BinaryIO) -> tuple[str, list[_Element]]:
-    """Returns the byte order and elements; leaves the file at the first byte of the data."""
+    """Reads the byte order and elements; leaves the file at the first byte of the data."""
     if file.readline(16).strip() != b"ply":
         raise SceneFileError(path, "not a PLY file (it does not begin with 'ply')")
     elements: list[_Element] = []
@@ -205,7 +205,7 @@ def _as_count(word: str) -> int:
 
 
 def _with_property(element: _Element, words: list[str]) -> _Element:
-    """Returns the element with one more column, from a line such as `float x`."""
+    """Adds a column to the element, from a line such as `float x`."""
     if words[0] == "list":
         return _Element(element.name, element.count, element.fields, has_lists=True)
     column = (words[1], _TYPES[words[0]])
@@ -215,7 +215,7 @@ def _with_property(element: _Element, words: list[str]) -> _Element:
 
 
 def _find_vertices(path: Path, elements: list[_Element]) -> tuple[_Element, list[_Element]]:
-    """Returns the element that holds the Gaussians, and those that lie before it."""
+    """Finds the element that holds the Gaussians, and those that lie before it."""
     names = [element.name for element in elements]
     if "vertex" not in names:
         raise SceneFileError(path, f"there is no element 'vertex', only {names}")
@@ -235,7 +235,7 @@ def _find_vertices(path: Path, elements: list[_Element]) -> tuple[_Element, list
 def _read_binary(
     path: Path, file: BinaryIO, byte_order: str, vertex: _Element, before: list[_Element]
 ) -> dict[str, np.ndarray]:
-    """Returns the columns of the vertices as float32."""
+    """Reads the columns of the vertices as float32."""
 
     def row_type(element: _Element) -> np.dtype:
         return np.dtype([(name, byte_order + kind) for name, kind in element.fields])
@@ -254,7 +254,7 @@ def _read_binary(
 def _read_text(
     path: Path, file: BinaryIO, byte_order: str, vertex: _Element, before: list[_Element]
 ) -> dict[str, np.ndarray]:
-    """Returns the columns of the vertices as float32: numbers between white space."""
+    """Reads the columns of the vertices as float32, from numbers between white space."""
     del byte_order  # text has none
     start = sum(element.count * len(element.fields) for element in before)
     width = len(vertex.fields)
@@ -279,9 +279,9 @@ def _read_text(
 
 
 def _words(file: BinaryIO) -> Iterator[list[bytes]]:
-    """Yields what stands between white space, block by block.
+    """Yields the words between white space, block by block.
 
-    As a whole it takes 20 times the file.
+    Split as a whole, the file would take 20 times its size.
     """
     rest = b""
     while block := file.read(_BLOCK):
@@ -303,7 +303,7 @@ def _cut_off(path: Path, promised: int, found: int) -> SceneFileError:
 
 
 def _count_rest(path: Path, names: set[str]) -> int:
-    """Returns how many f_rest fields there are, once all that a scene needs is there."""
+    """Counts the f_rest fields, once all that a scene needs is there."""
     num_rest = sum(name.startswith("f_rest_") for name in names)
     missing = [name for name in _scene_fields(0) if name not in names and name not in _NORMAL]
     if missing:

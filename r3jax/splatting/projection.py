@@ -155,9 +155,9 @@ def rotation_rows(quats: Float[Array, "n 4"]) -> list[list[Array]]:
 def _reach(
     camera: Camera, center: Array, xx: Array, yy: Array, opacity: Array, valid: Array
 ) -> Float[Array, "2 n"]:
-    """Returns the exact box of the ellipse on which alpha = 1/255.
+    """Computes the exact box of the ellipse on which alpha = 1/255.
 
-    O exp(-s) = 1/255, s = d^T conic d / 2.
+    There o exp(-s) = 1/255, with s = d^T conic d / 2.
 
     The largest |dx| on the ellipse s = s_max is sqrt(2 s_max cov_xx).
     """

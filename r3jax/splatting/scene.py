@@ -56,7 +56,7 @@ a_scene = one(GaussianScene, "r3jax.fit and r3jax.read_scene give one", leaf="me
 
 
 def empty_scene(capacity: int, sh_degree: int = 3) -> GaussianScene:
-    """Returns a scene of unused rows."""
+    """Makes a scene of unused rows."""
     return GaussianScene(
         means=jnp.zeros((capacity, 3)),
         quats=jnp.zeros((capacity, 4)).at[:, 0].set(1.0),

@@ -77,7 +77,7 @@ class Views(eqx.Module):
         )
 
     def take(self, indices: np.ndarray) -> "Views":
-        """Returns some of the views, in the order of the indices."""
+        """Selects some of the views, in the order of the indices."""
         return jax.tree.map(lambda x: x[jnp.asarray(indices)], self)
 
 
@@ -135,7 +135,7 @@ def load_views(frames: Iterable[Frame], resolution: int | None = None) -> Views:
 
 
 def fitted_size(width: int, height: int, resolution: int | None) -> tuple[int, int]:
-    """Returns the width and height [px] when the longer side has at most `resolution` pixels."""
+    """Computes width and height [px] whose longer side has at most `resolution` pixels."""
     longer = max(width, height)
     if resolution is None or resolution >= longer:
         return width, height
@@ -144,7 +144,7 @@ def fitted_size(width: int, height: int, resolution: int | None) -> tuple[int, i
 
 
 def split_views(count: int, every: int = 8) -> tuple[np.ndarray, np.ndarray]:
-    """Returns indices for training and for testing.
+    """Splits the views into indices for training and for testing.
 
     Every 8th view is held out, beginning with the first.
 
@@ -200,7 +200,7 @@ def area_average(image: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def _overlaps(long: int, short: int) -> np.ndarray:
-    """Returns the share of each new pixel that each old one covers, [short, long].
+    """Computes the share of each new pixel that each old one covers, [short, long].
 
     Rows sum to 1.
     """
@@ -212,7 +212,7 @@ def _overlaps(long: int, short: int) -> np.ndarray:
 
 
 def median_depth(depth: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Returns the lower median of the measurements whose pixel centers lie in each new pixel.
+    """Computes the lower median of the measurements whose pixel centers lie in each new pixel.
 
     Args:
         depth: [H, W] [m]; 0 is no measurement, inf is a measurement (beyond range).

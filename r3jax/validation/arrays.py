@@ -20,7 +20,7 @@ _SQUEEZE = 200
 
 
 def read_npz(path: str | Path, types: Mapping[str, str]) -> dict[str, np.ndarray]:
-    """Returns the arrays of an NPZ file.
+    """Reads the arrays of an NPZ file.
 
     Args:
         path: the file.
@@ -57,7 +57,7 @@ def read_npz(path: str | Path, types: Mapping[str, str]) -> dict[str, np.ndarray
 
 
 def read_npy(data: bytes) -> np.ndarray:
-    """Returns the array of an NPY file.
+    """Reads the array of an NPY file.
 
     Raises:
         ForeignFileError: not an NPY, cut off, or no plain numbers or texts.
@@ -71,7 +71,7 @@ def read_npy(data: bytes) -> np.ndarray:
 
 
 def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    """Returns one member."""
+    """Reads one member."""
     with archive.open(info) as file:
         return _array(file, info.filename, info.file_size)
 

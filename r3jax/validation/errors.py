@@ -56,6 +56,6 @@ def why_not_imported(error: ImportError, package: str, what_for: str, extra: str
 
 
 def did_you_mean(given: str, known: Iterable[str]) -> str:
-    """Returns a question to put behind the name: the known one that is most like it, or nothing."""
+    """Suggests the known name that is most like this one, as a question; else nothing."""
     close = difflib.get_close_matches(given, list(known), n=1)
     return f" (did you mean {close[0]}?)" if close else ""

@@ -19,7 +19,7 @@ _MAX_POINTER = 1024
 
 
 def check_regular(path: str | Path) -> int:
-    """Returns the size of a regular file [bytes]; links are followed.
+    """Checks that a file is regular, and returns its size [bytes]; links are followed.
 
     Opening a pipe would block, and a device such as /dev/zero has no end.
 
@@ -47,7 +47,7 @@ def check_regular(path: str | Path) -> int:
 
 
 def read_bytes(path: str | Path, limit: int) -> bytes:
-    """Returns the whole content of a regular file.
+    """Reads the whole content of a regular file.
 
     Args:
         path: the file.
@@ -96,7 +96,7 @@ _LONGEST = 1000
 
 
 def check_relative(name: str) -> PurePosixPath:
-    """Returns a relative path that stays below the folder it is relative to.
+    """Checks that a relative path stays below the folder it is relative to.
 
     Links inside the folder may still lead elsewhere: they are the user's own.
 
@@ -138,12 +138,12 @@ def below(folder: Path, name: str) -> Path:
 
 
 def _is_absolute(name: str) -> bool:
-    """Returns True for the absolute paths of any system."""
+    """Checks for absolute paths of any operating system."""
     return name.startswith(("/", "\\")) or re.match(r"[A-Za-z]:[\\/]", name) is not None
 
 
 def _respelled(folder: Path, name: str) -> str:
-    """Returns a name of Windows, or an absolute one, as a file of the folder is called here."""
+    """Converts a name of Windows, or an absolute one, to that of a file in the folder."""
     parts = PureWindowsPath(name).parts
     if ".." in parts or os.path.exists(folder / name.lstrip("/")):
         return name
@@ -154,7 +154,7 @@ def _respelled(folder: Path, name: str) -> str:
 
 
 def _namesake(path: Path) -> Path:
-    """Returns the file, or where it is missing the one whose ending has the other case."""
+    """Finds the file, or if it is missing the one whose extension has the other case."""
     if not path.suffix or os.path.exists(path):  # no matter how long the name is
         return path
     others = (path.with_suffix(path.suffix.lower()), path.with_suffix(path.suffix.upper()))

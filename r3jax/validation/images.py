@@ -35,7 +35,7 @@ _WHITE = (1 << 16) - 1
 
 
 def image_size(path: Path | bytes, formats: Sequence[str]) -> tuple[int, int]:
-    """Returns the width and height of an image [px].
+    """Reads the width and height of an image [px].
 
     Raises:
         ForeignFileError: not an image of these formats, broken, or too large.
@@ -46,7 +46,7 @@ def image_size(path: Path | bytes, formats: Sequence[str]) -> tuple[int, int]:
 
 
 def first_size(paths: Iterable[Path], formats: Sequence[str]) -> tuple[int, int]:
-    """Returns the width and height of the first image that can be opened, of some of one size [px].
+    """Reads the width and height of the first image that opens, of some of one size [px].
 
     Raises:
         ForeignFileError, OSError: as `image_size`, of the first of them; none can be opened.
@@ -67,7 +67,7 @@ def image_pixels(
     modes: Sequence[str] = (),
     wanted: str = "",
 ) -> np.ndarray:
-    """Returns the pixels of an image.
+    """Reads the pixels of an image.
 
     Args:
         path: the file, or what it holds.
@@ -174,9 +174,9 @@ def _colors(image: Any) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def _eight_bits(gray: np.ndarray) -> np.ndarray:
-    """Returns the gray values of 16 bits [H, W] as 8.
+    """Converts gray values of 16 bits [H, W] to 8.
 
-    Pillow itself would clip them, so that all are white.
+    Pillow itself would clip them, and make almost all of them white.
     """
     if gray.dtype.kind == "f" or gray.min() < 0 or gray.max() > _WHITE:
         raise ForeignFileError(

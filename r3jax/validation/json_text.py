@@ -29,7 +29,7 @@ _LARGEST_WHOLE = 1 << 63
 
 
 def parse_json(data: bytes | str) -> Any:
-    """Returns the value of a JSON text. All its numbers are finite, all its texts can be encoded.
+    """Parses a JSON text. All its numbers are finite, all its texts can be encoded.
 
     Raises:
         ForeignFileError: not UTF-8, not JSON, numbers that are not finite or have more than 63
@@ -91,12 +91,12 @@ def _whole(word: str) -> int:
 
 
 def sealed(plain: dict[str, Any]) -> dict[str, Any]:
-    """Returns a JSON object with a seal, a hash of all that it says: its last field."""
+    """Seals a JSON object: its last field becomes a hash of the others."""
     return {**plain, _SEAL: _seal_of(plain)}
 
 
 def unsealed(plain: dict[str, Any]) -> dict[str, Any]:
-    """Returns a JSON object without its seal; one that was never sealed as it is.
+    """Removes the seal of a JSON object after checking it; one without a seal stays as it is.
 
     Raises:
         ForeignFileError: the seal is not that of the rest.

@@ -66,7 +66,7 @@ def depth_buffer(voxels: Voxels, view: View, config: VisibilityConfig) -> DepthB
 
 
 def _nearest(voxels: Voxels, view: View) -> tuple[Float[Array, "h w"], Int[Array, "h w"]]:
-    """Returns the distance and number of the nearest voxel in every pixel."""
+    """Finds the distance and number of the nearest voxel in every pixel."""
     shapes = pyramid(view.shape)
     offsets = [0]
     for height, width in shapes:
@@ -108,23 +108,23 @@ def visible(
 
 
 def sees_voxels(voxels: Voxels, view: View, buffer: DepthBuffer) -> Bool[Array, " n"]:
-    """Returns True for the voxels in the image, within range, and not hidden as a whole."""
+    """Finds the voxels in the image, within range, and not hidden as a whole."""
     place = view.place(jax.lax.stop_gradient(voxels.center))
     margin = corner_margin(view, place, voxels.size, buffer.limit)
     return voxels.present & is_in_view(view, place) & (margin >= 0.0)
 
 
 def sees_points(points: Float[Array, "3 m"], view: View, buffer: DepthBuffer) -> Bool[Array, " m"]:
-    """Returns True for the points in the image, within range, and before every voxel."""
+    """Finds the points in the image, within range, and before every voxel."""
     place = view.place(jax.lax.stop_gradient(points))
     # Before the surface itself: the slack behind it is for voxels that belong to it.
     return is_in_view(view, place) & (depth_margin(view, place, buffer.distance) >= 0.0)
 
 
 def depth_margin(view: View, place: Placement, limit: Float[Array, "h w"]) -> Float[Array, " n"]:
-    """Returns how far before `limit` points lie at their pixel [m]; negative.
+    """Computes how far points lie before `limit` at their pixel [m].
 
-    Something hides them.
+    It is negative for a point that something hides.
     """
     return _at_pixel(limit, place.column, place.row, wraps=view.wraps) - place.distance
 
@@ -152,7 +152,7 @@ def corner_margin(
 
 
 def is_in_image(view: View, place: Placement) -> Bool[Array, " n"]:
-    """Returns True for points that fall into the image, at any distance."""
+    """Checks which points fall into the image, at any distance."""
     height, width = view.shape
     # Half-open: a point on the far border belongs to a pixel that is not there.
     is_in = (place.column >= 0.0) & (place.column < width) & place.ahead
@@ -160,7 +160,7 @@ def is_in_image(view: View, place: Placement) -> Bool[Array, " n"]:
 
 
 def is_in_view(view: View, place: Placement) -> Bool[Array, " n"]:
-    """Returns True for points in the image and within range."""
+    """Checks which points lie in the image and within range."""
     return is_in_image(view, place) & (place.distance <= view.max_range)
 
 
@@ -171,7 +171,7 @@ def _at_pixel(
     *,
     wraps: bool,
 ) -> Float[Array, " n"]:
-    """Returns values at continuous coordinates; outside, where the map wraps, or at the border."""
+    """Reads values at continuous coordinates; outside, where the map wraps, or at the border."""
     height, width = image.shape
 
     def whole(value: Array, size: int) -> Array:
@@ -204,7 +204,7 @@ def footprint(
     *,
     wraps: bool,
 ) -> list[Int[Array, " n"]]:
-    """Returns indices into the pyramid of the pixels that each voxel covers; behind its end: none.
+    """Finds the pixels of the pyramid that each voxel covers; indices past its end mean none.
 
     The level is the first on which the footprint spans at most two pixel centers an axis. A
     footprint is the octagon round the projected cube.
@@ -304,9 +304,9 @@ def surface_limit(
 def _slope(
     distance: Float[Array, "h w"], padded: Float[Array, "hp wp"], step: int, axis: int
 ) -> Float[Array, "h w"]:
-    """Returns the change per pixel on the flatter side of each pixel [m/px].
+    """Computes the change per pixel on the flatter side of each pixel [m/px].
 
-    0 where the sides disagree.
+    It is 0 where the sides disagree.
 
     So neither a silhouette nor a ragged edge counts as a slope.
     """

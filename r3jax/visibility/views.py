@@ -227,7 +227,7 @@ def for_kernels(view: View, tolerance: Float[Array, ""], focal: Float[Array, ""]
 def pinhole_view(
     camera: Camera, T_world_camera: Float[Array, "4 4"], config: VisibilityConfig
 ) -> PinholeView:
-    """Returns the view of a camera; its longest side is reduced to `config.zbuffer_size` pixels.
+    """Makes the view of a camera, with at most `config.zbuffer_size` pixels on its longest side.
 
     Visibility is piecewise constant, so no derivative passes through the pose.
     """
@@ -240,7 +240,7 @@ def pinhole_view(
 
 
 def panorama_view(position: Float[Array, " 3"], config: VisibilityConfig) -> PanoramaView:
-    """Returns all directions from a position; no derivative passes through it."""
+    """Makes the view of all directions from a position; no derivative passes through it."""
     still = jax.lax.stop_gradient(position)
     return PanoramaView(still, config.max_range, config.panorama_size)
 
@@ -248,9 +248,9 @@ def panorama_view(position: Float[Array, " 3"], config: VisibilityConfig) -> Pan
 def wrap(
     row: Int[Array, " n"], column: Int[Array, " n"], size: Int[Array, " n"]
 ) -> tuple[Int[Array, " n"], Int[Array, " n"]]:
-    """Returns pixels one step outside the octahedral map.
+    """Maps pixels one step outside the octahedral map to the pixels they continue at.
 
-    Its borders are glued to themselves, turned.
+    The borders of the map are glued to themselves, turned.
     """
     crosses_column = (column < 0) | (column >= size)
     crosses_row = (row < 0) | (row >= size)

@@ -28,12 +28,12 @@ __all__ = ["describe", "open_scene", "open_world", "outside_scenes", "scene_hash
 
 
 def scene_names() -> list[str]:
-    """Returns names of the embedded scenes; `outside_scenes` says what else can be opened."""
+    """Lists the embedded scenes; `outside_scenes` lists what else can be opened."""
     return list(procedural.names())
 
 
 def describe(name: str) -> str:
-    """Returns one line about a scene.
+    """Describes a scene in one line.
 
     Raises:
         ValueError: the scene is unknown; the message lists the known ones.
@@ -44,7 +44,7 @@ def describe(name: str) -> str:
 
 @naming_extras()
 def open_world(spec: str, up: str | None = None, scale: float | int = 1.0) -> World:
-    """Returns the triangles and materials behind a scene's name.
+    """Opens the triangles and materials behind a scene's name.
 
     Args:
         spec: the name of an embedded scene, or one of `outside_scenes`. Of a Habitat scene this is
@@ -132,9 +132,9 @@ def open_scene(
 
 
 def scene_hash(simulator: Simulator) -> str:
-    """Returns SHA-256 of what a simulator from `open_scene` shows.
+    """Hashes by SHA-256 what a simulator from `open_scene` shows.
 
-    Geometry, colors, lamps, by whom.
+    That is geometry, colors and lamps, and the renderer.
 
     Raises:
         ValueError: the simulator does not come from `open_scene`.

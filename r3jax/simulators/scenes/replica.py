@@ -35,12 +35,12 @@ _HOW_TO_GET = (
 
 
 def names() -> list[str]:
-    """Returns the nine scenes, as the paper calls them."""
+    """Lists the nine scenes, as the paper calls them."""
     return list(_FOLDERS)
 
 
 def mesh_file(name: str) -> Path:
-    """Returns the mesh of a scene: z-up, meters.
+    """Finds the mesh of a scene: z-up, meters.
 
     Raises:
         ValueError: the scene is unknown, or its file is not there; says how to get it.
@@ -52,7 +52,7 @@ def mesh_file(name: str) -> Path:
 
 
 def stage_file(name: str) -> Path:
-    """Returns the stage config of a scene, for Habitat-Sim.
+    """Finds the stage config of a scene, for Habitat-Sim.
 
     Raises:
         ValueError: the scene is unknown, or its file is not there; says how to get it.

@@ -38,7 +38,7 @@ def rasterize(
 def composite_pixel(
     projected: ProjectedGaussians, u: Float[Array, ""], v: Float[Array, ""]
 ) -> tuple[Float[Array, " 3"], Float[Array, ""], Float[Array, ""]]:
-    """Returns one pixel, Gaussians sorted from near to far.
+    """Composites one pixel from Gaussians sorted from near to far.
 
     Returns:
         Color on black, sum of weight x depth, and alpha, at the pixel coordinates (u, v).

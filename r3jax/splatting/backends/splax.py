@@ -85,7 +85,7 @@ def rasterize(
 def pixel_view(
     camera: Camera, T_world_camera: Float[Array, "4 4"], focal: float
 ) -> Float[Array, "4 4"]:
-    """Returns the view matrix that gives our pixels in a camera with square pixels, centered.
+    """Computes the view matrix that gives our pixels in a centered camera with square pixels.
 
     Args:
         camera: intrinsics.

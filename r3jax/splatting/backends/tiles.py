@@ -102,7 +102,7 @@ def list_tiles(
 def tile_boxes(
     center: Float[Array, "2 n"], reach: Float[Array, "2 n"], columns: int, rows: int
 ) -> TileBoxes:
-    """Returns the tiles that the boxes center +- reach [px] touch, on a grid of columns x rows."""
+    """Finds the tiles that the boxes center +- reach [px] touch, on a grid of columns x rows."""
     is_drawn = reach[0] >= 0.0
 
     def span(axis: int, size: int) -> tuple[Array, Array]:
@@ -121,7 +121,7 @@ def tile_boxes(
 
 
 def near_to_far(depth: Float[Array, " n"], is_drawn: Bool[Array, " n"]) -> Int[Array, " n"]:
-    """Returns the order by depth of what is drawn, then the rest. Stable.
+    """Sorts Gaussians that are drawn by depth, then the rest; returns the order. Stable.
 
     A radix sort: each pass sorts by some bits of the depth, the lowest first, the place in the
     order so far being the low bits of its keys.
@@ -144,7 +144,7 @@ def near_to_far(depth: Float[Array, " n"], is_drawn: Bool[Array, " n"]) -> Int[A
 def _running_total(
     count: Int[Array, " n"], num_tiles: int
 ) -> tuple[Int[Array, " n"], Int[Array, ""]]:
-    """Returns the sum of the counts up to each, and of all.
+    """Computes the running sum of the counts, and their total.
 
     Both saturate instead of wrapping around.
     """
@@ -156,7 +156,7 @@ def _running_total(
 
 
 def _sizes(budget: int) -> list[int]:
-    """Returns numbers of slots to sort, falling.
+    """Lists the numbers of slots that may be sorted, falling.
 
     Sorting the whole budget would often be a waste.
     """

@@ -164,7 +164,7 @@ composite.defvjp(_composite_fwd, _composite_bwd)
 
 
 def _forward(layout: Layout, splats: Float[Array, "n 10"], lists: TileLists) -> Array:
-    """Returns the image [H, W, 5]."""
+    """Renders the image [H, W, 5]."""
     order = _by_count(layout, lists)
 
     def composite_batch(i: Array, tiles: Array) -> Array:
@@ -194,7 +194,7 @@ def _backward(
     image: Float[Array, "H W 5"],
     cotangent: Float[Array, "H W 5"],
 ) -> Float[Array, "n 10"]:
-    """Returns the gradient by the splats."""
+    """Computes the gradient by the splats."""
     order = _by_count(layout, lists)
     wanted = _to_tiles(layout, order, cotangent)
     total = jnp.sum(wanted * _to_tiles(layout, order, image), axis=1)
@@ -252,12 +252,12 @@ def _rows(
 
 
 def _take(layout: Layout, x: Num[Array, "N ..."], i: Int[Array, ""]) -> Num[Array, "B ..."]:
-    """Returns the part of x that belongs to batch i."""
+    """Slices the part of x that belongs to batch i."""
     return jax.lax.dynamic_slice_in_dim(x, i * layout.batch, layout.batch)
 
 
 def _by_count(layout: Layout, lists: TileLists) -> Int[Array, " N"]:
-    """Returns the tiles, those with most Gaussians first, filled up to whole batches with -1."""
+    """Sorts the tiles, those with most Gaussians first, padded to whole batches with -1."""
     order = jnp.argsort(-lists.count)
     return jnp.pad(
         order, (0, layout.num_batches * layout.batch - order.shape[0]), constant_values=-1

@@ -56,7 +56,7 @@ def stage(go: Bool[Array, ""], compute: Callable[..., Array], *args: Array) -> A
 def see_chunk(
     go: Bool[Array, ""], splats: Float[Array, "11 B G"], through: Float[Array, "B P"]
 ) -> Chunk:
-    """Returns a chunk as the pixels see it, `through` being the transmittance before it."""
+    """Evaluates a chunk at the pixels; `through` is the transmittance before it."""
     alpha = stage(go, _alpha, splats)
     products = stage(go, lambda alpha: _chain(1.0 - alpha, jnp.multiply), alpha)
     firsts, last = _link(through, products, jnp.multiply)
@@ -65,7 +65,7 @@ def see_chunk(
 
 
 def chunk_sums(chunk: Chunk) -> Float[Array, "B 5 P"]:
-    """Returns the sum of weight x (RGB, depth, 1) over the Gaussians of the chunk."""
+    """Sums weight x (RGB, depth, 1) over the Gaussians of the chunk."""
     return jnp.einsum("kbg,bgp->bkp", chunk.splats[6:], chunk.weight)
 
 
@@ -76,7 +76,7 @@ def chunk_gradient(
     total: Float[Array, "B P"],
     so_far: Float[Array, "B P"],
 ) -> tuple[Float[Array, "10 B G"], Float[Array, "B P"]]:
-    """Returns the gradient by the splats of a chunk.
+    """Computes the gradient by the splats of a chunk.
 
     With the transmittance T_i in front, the features c_i and v the cotangent of the pixel:
     alpha_i dL/dalpha_i = T_i alpha_i c_i.v - alpha_i / (1 - alpha_i) sum_(j > i) T_j alpha_j c_j.v
@@ -102,7 +102,7 @@ def chunk_gradient(
 
 
 def _alpha(splats: Float[Array, "11 B G"]) -> Float[Array, "B G P"]:
-    """Returns min(0.99, o exp(-s)) at each pixel of the tile, 0 where it is skipped."""
+    """Computes min(0.99, o exp(-s)) at each pixel of the tile, 0 where it is skipped."""
     x, y, xx, xy, yy, opacity = splats[:6, :, :, None]
     px, py = (c[None, None, :] for c in pixel_offsets())
     dx, dy = x - px, y - py
@@ -127,7 +127,7 @@ def _pull(
     firsts: Float[Array, "B O P"],
     total: Float[Array, "B P"],
 ) -> Float[Array, "B G P"]:
-    """Returns the product alpha dL/dalpha; 0 where alpha is clipped, for then it does not move."""
+    """Computes alpha dL/dalpha; 0 where alpha is clipped, since it is constant there."""
     later = total[:, None, :] - (firsts[:, :, None] + sums).reshape(alpha.shape)
     pull = gain - later * (alpha / (1.0 - alpha))
     return jnp.where((weight > 0.0) & (alpha < ALPHA_MAX), pull, 0.0)
@@ -136,7 +136,7 @@ def _pull(
 def _shape_gradient(
     splats: Float[Array, "11 B G"], moments: Float[Array, "6 B G"]
 ) -> Float[Array, "6 B G"]:
-    """Returns the gradient by center, conic and opacity.
+    """Computes the gradient by center, conic and opacity.
 
     Args:
         splats: the Gaussians.
@@ -155,7 +155,7 @@ def _shape_gradient(
 
 
 def _chain(x: Float[Array, "B G P"], op: Operation) -> Float[Array, "B O I P"]:
-    """Returns the running products or sums within blocks of up to 8 elements of G."""
+    """Computes running products or sums within blocks of up to 8 elements of G."""
     tiles, size, pixels = x.shape
     inner = max(d for d in range(1, 9) if size % d == 0)
     blocks = x.reshape(tiles, size // inner, inner, pixels)
@@ -168,7 +168,7 @@ def _chain(x: Float[Array, "B G P"], op: Operation) -> Float[Array, "B O I P"]:
 def _link(
     start: Float[Array, "B P"], chains: Float[Array, "B O I P"], op: Operation
 ) -> tuple[Float[Array, "B O P"], Float[Array, "B P"]]:
-    """Returns what comes before each block of `_chain`, from `start` on, and after the last."""
+    """Chains the blocks of `_chain` from `start` on: the values before each, and after the last."""
     firsts = [start]
     for i in range(chains.shape[1]):
         firsts.append(op(firsts[-1], chains[:, i, -1]))
@@ -176,12 +176,12 @@ def _link(
 
 
 def pixel_offsets() -> tuple[Float[Array, " P"], Float[Array, " P"]]:
-    """Returns centers of a tile's pixels, row by row, relative to its middle [px]."""
+    """Computes the centers of a tile's pixels, row by row, relative to its middle [px]."""
     along = jnp.arange(TILE, dtype=jnp.float32) - 0.5 * (TILE - 1)
     return jnp.tile(along, TILE), jnp.repeat(along, TILE)
 
 
 def _moments() -> Float[Array, "P 6"]:
-    """Returns 1, x, y, x^2, xy, y^2 at a tile's pixels."""
+    """Computes 1, x, y, x^2, xy, y^2 at a tile's pixels."""
     x, y = pixel_offsets()
     return jnp.stack([jnp.ones(PIXELS), x, y, x * x, x * y, y * y], axis=-1)

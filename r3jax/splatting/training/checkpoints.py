@@ -40,7 +40,7 @@ _MAX_BYTES = 16 << 20
 
 
 def settings_record(config: TrainConfig, views: Views, extent: float) -> dict[str, Any]:
-    """Returns what must be the same for a training to go on: settings, views and extent.
+    """Records what must not change when training resumes: settings, views and extent.
 
     The budget of intersections is left out: the result does not depend on it.
     """
@@ -138,13 +138,13 @@ def remove_checkpoints(folder: Path) -> None:
 
 
 def _named(state: Any) -> dict[str, Any]:
-    """Returns the arrays of a state (or of nested tables) by their names, such as `scene.means`."""
+    """Names the arrays of a state (or of nested tables), such as `scene.means`."""
     leaves = jax.tree_util.tree_leaves_with_path(state)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 
 def read_checkpoint(folder: Path, settings: dict[str, Any], like: TrainState) -> TrainState:
-    """Returns the newest state of a training with these settings.
+    """Reads the newest state of a training with these settings.
 
     Args:
         folder: where it was saved.
@@ -171,7 +171,7 @@ def read_checkpoint(folder: Path, settings: dict[str, Any], like: TrainState) ->
 
 
 def _state_of(stored: dict[str, Any], like: TrainState) -> TrainState:
-    """Returns a state from its arrays. Earlier versions of this package nested them, by field.
+    """Builds a state from its arrays. Earlier versions of this package nested them, by field.
 
     Raises:
         ForeignFileError: arrays that are missing or of another shape, and numbers that no

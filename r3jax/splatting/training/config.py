@@ -179,7 +179,7 @@ class TrainConfig(eqx.Module):
         return 2 * self.num_gaussians if self.capacity is None else self.capacity
 
     def schedule(self) -> Schedule:
-        """Returns the schedule of this run. That of the paper for 30000 iterations or more."""
+        """Returns the schedule of this run: that of the paper for 30000 iterations or more."""
         tenth = max(1, self.iterations // 10)
         last, share = (15_000, (1, 2)) if self.strategy == "vanilla" else (25_000, (5, 6))
         until = min(last, self.iterations * share[0] // share[1])

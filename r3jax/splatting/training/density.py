@@ -50,7 +50,7 @@ class Refinement(NamedTuple):
 
 
 def empty_statistics(capacity: int) -> DensityStatistics:
-    """Returns statistics of no view."""
+    """Returns the statistics of no view."""
     return DensityStatistics(gradient=jnp.zeros(capacity), count=jnp.zeros(capacity))
 
 
@@ -135,7 +135,7 @@ def _pruned(
     prunes_large: Bool[Array, ""] | bool,
     config: TrainConfig,
 ) -> Bool[Array, " n"]:
-    """Returns the too faint, or too large even after a split."""
+    """Finds Gaussians that are too faint, or too large even after a split."""
     is_faint = jax.nn.sigmoid(scene.opacity_logits) < config.prune_opacity
     size_after = jnp.where(will_split, size / SHRINK, size)
     is_huge = jnp.asarray(prunes_large) & (size_after > config.prune_size * extent)
@@ -158,7 +158,7 @@ def pair_rows(
 
 
 def _marked(rows: Int[Array, " n"], is_real: Bool[Array, " n"]) -> Bool[Array, " n"]:
-    """Returns the mask of the rows that are named by real entries."""
+    """Marks the rows that are named by real entries."""
     return jnp.zeros(rows.shape[0], dtype=bool).at[rows].max(is_real)
 
 

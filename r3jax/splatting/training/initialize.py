@@ -126,7 +126,7 @@ def surface_points(views: Views) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _unproject(camera: Camera, pose: np.ndarray, depth: np.ndarray, chosen: np.ndarray):
-    """Returns the world coordinates [m, 3] of the chosen pixels' centers."""
+    """Computes the world coordinates [m, 3] of the chosen pixels' centers."""
     row, column = np.nonzero(chosen)
     z = depth[row, column].astype(np.float64)
     x = (column + 0.5 - float(camera.cx)) / float(camera.fx) * z
@@ -135,9 +135,9 @@ def _unproject(camera: Camera, pose: np.ndarray, depth: np.ndarray, chosen: np.n
 
 
 def _on_edge(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """Returns pixels beside a step in depth, [H, W].
+    """Finds pixels beside a step in depth, [H, W].
 
-    Holes are no neighbors, what is beyond range is.
+    Holes do not count as neighbors, pixels beyond the range do.
     """
     share = max(_EDGE_STEP, _STEEPEST / float(camera.focal))
     capped = np.minimum(depth, np.float32(1e6))  # differences stay finite
@@ -179,9 +179,9 @@ def fitting_voxel_size(points: np.ndarray, num_gaussians: int) -> float:
 
 
 def _voxel_keys(points: np.ndarray, voxel_size: float) -> np.ndarray:
-    """Returns one number for all points in a voxel, [m] int64.
+    """Computes one number for all points in a voxel, [m] int64.
 
-    Neighbors along z follow each other.
+    Neighbors along z have consecutive numbers.
     """
     key = np.zeros(len(points), dtype=np.int64)
     num_cells = 1
@@ -207,7 +207,7 @@ def _num_occupied(points: np.ndarray, voxel_size: float) -> int:
 def thin(
     points: np.ndarray, colors: np.ndarray, voxel_size: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the mean point and the mean color of each occupied voxel, [n, 3] float64 both.
+    """Averages the points and the colors in each occupied voxel, [n, 3] float64 both.
 
     Args:
         points: [m, 3] [m], at least one.
@@ -226,7 +226,7 @@ def thin(
 
 
 def neighbor_scales(points: np.ndarray) -> np.ndarray:
-    """Returns the root mean square distance to the 3 nearest other points [m], within limits, [n].
+    """Computes the root mean square distance to the 3 nearest points [m], within limits, [n].
 
     Points that coincide, and stray ones, are held within a fifth and five times the median. A
     single point gets 5 cm.
@@ -241,7 +241,7 @@ def neighbor_scales(points: np.ndarray) -> np.ndarray:
 
 
 def _random_points(views: Views, count: int, key: Array) -> tuple[np.ndarray, np.ndarray]:
-    """Returns points drawn evenly inside a box around the cameras and what they look at.
+    """Draws points evenly inside a box around the cameras and their targets.
 
     What they look at is taken to lie as far ahead as the cameras are apart, at least 1 m.
     """
@@ -258,7 +258,7 @@ def _random_points(views: Views, count: int, key: Array) -> tuple[np.ndarray, np
 def _as_scene(
     points: np.ndarray, colors: np.ndarray, capacity: int, sh_degree: int
 ) -> GaussianScene:
-    """Returns the round Gaussians of one opacity; unused rows behind."""
+    """Makes round Gaussians of one opacity, and unused rows after them."""
     n = len(points)
     log_scales = np.zeros((capacity, 3), dtype=np.float32)
     log_scales[:n] = np.log(neighbor_scales(points))[:, None]

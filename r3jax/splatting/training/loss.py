@@ -17,7 +17,7 @@ def loss_and_error(
     target: Float[Array, "H W 3"],
     lambda_dssim: Float[Array, ""] | float,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Returns the loss of an image, and the mean squared error of its colors clipped to [0, 1].
+    """Computes the loss of an image, and the mean squared error of its clipped colors.
 
     The loss can be differentiated by `rgb`.
     """
@@ -67,7 +67,7 @@ def photometric_loss(
     target: Float[Array, "H W 3"],
     lambda_dssim: Float[Array, ""] | float,
 ) -> Float[Array, ""]:
-    """Returns (1 - lambda) L1 + lambda (1 - SSIM)."""
+    """Computes (1 - lambda) L1 + lambda (1 - SSIM)."""
     l1 = jnp.mean(jnp.abs(rgb - target))
     return (1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - structural_similarity(rgb, target))
 
@@ -91,7 +91,7 @@ def structural_similarity(
 
 @jax.custom_vjp
 def blur(planes: Float[Array, "c H W"]) -> Float[Array, "c H W"]:
-    """Returns each plane under the Gaussian window, zeros beyond the edges.
+    """Filters each plane with the Gaussian window, zeros beyond the edges.
 
     Separable, as shifted sums: XLA's convolutions are 60 times slower on CPUs.
     """
@@ -108,5 +108,5 @@ blur.defvjp(lambda planes: (blur(planes), None), lambda _, gradient: (blur(gradi
 
 
 def psnr_of(mse: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Returns the peak signal-to-noise ratio [dB] of a mean squared error of colors in [0, 1]."""
+    """Computes the PSNR [dB] from a mean squared error of colors in [0, 1]."""
     return -10.0 * jnp.log10(jnp.maximum(mse, 1e-10))

@@ -132,7 +132,7 @@ def _drawn(weight: Float[Array, " n"], key: PRNGKeyArray) -> Int[Array, " n"]:
 def shared(
     opacity: Float[Array, " n"], number: Int[Array, " n"]
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Returns the opacity and scale of `number` Gaussians that together look like one (eq. 9).
+    """Computes opacity and scale of `number` Gaussians that together look like one (eq. 9).
 
         o' = 1 - (1 - o)^(1/N)
         scale' / scale = o / sum_{i=1..N} sum_{k=0..i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1)

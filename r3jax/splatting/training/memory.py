@@ -39,7 +39,7 @@ _RESERVE = 0.05
 
 
 def training_bytes(width: int, height: int, config: TrainConfig, rows: int | None = None) -> int:
-    """Returns bytes that training takes besides the images of the views.
+    """Estimates the memory of training besides the images of the views [bytes].
 
     Args:
         width: of the views [px].
@@ -128,13 +128,13 @@ def _read(path: Path) -> str:
 
 
 def _number(path: Path) -> int | None:
-    """Returns the number in a file; None if it is not there or says `max`."""
+    """Reads the number in a file; None if it is missing or says `max`."""
     text = _read(path).strip()
     return int(text) if text.isdecimal() else None
 
 
 def _number_after(path: Path, name: str) -> int | None:
-    """Returns the number behind a name in a file of such lines."""
+    """Reads the number after a name in a file of such lines."""
     for line in _read(path).splitlines():
         words = line.split()
         if len(words) >= 2 and words[0] == name and words[1].isdecimal():
@@ -170,7 +170,7 @@ def check_memory(views: Views, config: TrainConfig, *, free: int | None = None) 
 
 
 def _most_rows(width: int, height: int, config: TrainConfig, usable: int) -> int:
-    """Returns the largest capacity that fits; the estimate grows with it. 0 if not even 1 does."""
+    """Finds the largest capacity that fits: the estimate grows with it. 0 if not even 1 does."""
     low, high = 0, config.rows
     while high - low > 1:
         middle = (low + high) // 2

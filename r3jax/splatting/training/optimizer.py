@@ -36,7 +36,7 @@ class Moments(eqx.Module):
 
 
 def empty_moments(scene: GaussianScene) -> Moments:
-    """Returns moments of a scene that has seen no gradient."""
+    """Returns the moments of a scene before its first gradient."""
     # Two sets of buffers: the step gives both away.
     mean, square = (jax.tree.map(jnp.zeros_like, scene) for _ in range(2))
     return Moments(mean=mean, square=square, count=jnp.zeros((), dtype=jnp.int32))
@@ -45,7 +45,7 @@ def empty_moments(scene: GaussianScene) -> Moments:
 def mean_rate(
     config: TrainConfig, extent: Float[Array, ""], step: Int[Array, ""]
 ) -> Float[Array, ""]:
-    """Returns the learning rate of the centers [m] at iteration `step` (the first is 1).
+    """Computes the learning rate of the centers [m] at iteration `step` (the first is 1).
 
     It decays exponentially: log rate is linear in the iteration.
     """
@@ -63,7 +63,7 @@ def guarded_update(
     config: TrainConfig,
     is_wanted: Bool[Array, ""],
 ) -> tuple[GaussianScene, Moments, Bool[Array, ""]]:
-    """Returns one step of Adam, unless a parameter or a gradient is not finite.
+    """Takes one step of Adam, unless a parameter or a gradient is not finite.
 
     Args:
         scene: before.
@@ -98,9 +98,9 @@ def _by_formulas(
 
 
 def _squared_size(scene: GaussianScene) -> Float[Array, ""]:
-    """Returns the sum of all squares.
+    """Sums all squares.
 
-    Not finite if any entry is not, or would overflow Adam's moments.
+    The sum is not finite if any entry is not, or would overflow Adam's moments.
     """
     return jnp.asarray(sum(jnp.vdot(x, x) for x in jax.tree.leaves(scene)))
 
@@ -138,7 +138,7 @@ def adam_update(
     config: TrainConfig,
     is_applied: Bool[Array, ""],
 ) -> tuple[GaussianScene, Moments]:
-    """Returns one step of Adam (Kingma & Ba 2015), epsilon 1e-15, bias corrected.
+    """Takes one step of Adam (Kingma & Ba 2015), epsilon 1e-15, bias corrected.
 
     Unused rows have no gradient and stay as they are. If not `is_applied`, everything does.
     """

@@ -190,7 +190,7 @@ def fit(
 
 
 def scene_extent(views: Views) -> float:
-    """Returns the size of the captured space [m], the unit of several settings.
+    """Measures the size of the captured space [m], the unit of several settings.
 
     1.1 times the largest distance of a camera from the cameras' mean, as in 3DGS. Cameras that
     turn on the spot have none: then, and whenever it is larger, a tenth of the median depth.
@@ -204,7 +204,7 @@ def scene_extent(views: Views) -> float:
 
 
 def _first_scene(views: Views, config: TrainConfig, scene: GaussianScene | None) -> GaussianScene:
-    """Returns the given scene, or one from the views, with the wanted number of rows."""
+    """Returns the given scene, or makes one from the views, with the wanted number of rows."""
     if scene is None:
         key = jax.random.key(config.seed)
         return initialize(views, config.num_gaussians, config.rows, config.sh_degree, key=key)
@@ -260,7 +260,7 @@ class _Loop:
         return FitResult(self.state.scene, history, is_short, int(self.state.dropped))
 
     def _next_stop(self) -> int:
-        """Returns the step up to which nothing but steps has to happen."""
+        """Returns the step up to which nothing interrupts the steps of the optimizer."""
         if not self.is_compiled:
             return self.step + 1
         config = self.run.config

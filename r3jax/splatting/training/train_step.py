@@ -92,12 +92,12 @@ def start_state(scene: GaussianScene) -> TrainState:
 
 
 def _key(config: TrainConfig, purpose: int, number: Int[Array, ""]) -> PRNGKeyArray:
-    """Returns a function of the seed and the step alone, so that a resumed run draws the same."""
+    """Derives a key from the seed and the step alone, so that a resumed run draws the same."""
     return jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), purpose), number)
 
 
 def view_index(config: TrainConfig, number: Int[Array, ""], count: int) -> Int[Array, ""]:
-    """Returns the view that is the `number`-th to be shown: a new random order in every epoch."""
+    """Returns the `number`-th view to be shown, from a new random order in every epoch."""
     order = jax.random.permutation(_key(config, _ORDER, number // count), count)
     return order[number % count]
 
@@ -110,7 +110,7 @@ def train_step(
     config: TrainConfig,
     schedule: Schedule,
 ) -> tuple[TrainState, StepInfo]:
-    """Returns one step of the optimizer.
+    """Takes one step of the optimizer.
 
     Args:
         state: the previous state; its buffers are donated.
@@ -211,7 +211,7 @@ def _view_loss(
 
 
 def _in_view(scene: GaussianScene, view: PosedImage) -> Bool[Array, " n"]:
-    """Returns True where the center lies in the image."""
+    """Checks whether the centers lie in the image."""
     pixels, z = project(view.camera, transform(invert_pose(view.T_world_camera), scene.means))
     size = jnp.array([view.camera.width, view.camera.height], dtype=jnp.float32)
     inside = (pixels > 0.0) & (pixels < size[None, :])

@@ -236,7 +236,7 @@ class FloorPlan:
 
 
 def _wall(r: Room, side: str, z0: Real, z1: Real, holes: list[_Hole]) -> Shape:
-    """Returns one wall between two heights, seen from inside, without its openings."""
+    """Builds one wall between two heights, seen from inside, without its openings."""
     lo, hi = (r.x0, r.x1) if side in "ns" else (r.y0, r.y1)
     s = _ticks(lo, hi, [v for a, b, _, _ in holes for v in (a, b)])
     t = _ticks(z0, z1, [v for _, _, c, d in holes for v in (c, d)])
@@ -277,7 +277,7 @@ def _ticks(lo: Real, hi: Real, cuts: list[Real]) -> np.ndarray:
 def _tunnel(
     axis: str, gap: tuple[Real, Real], span: tuple[Real, Real], z: tuple[Real, Real]
 ) -> list[Shape]:
-    """Returns the four inner faces of an opening: floor, head and both jambs."""
+    """Builds the four inner faces of an opening: floor, head and both jambs."""
     (g0, g1), (s0, s1), (z0, z1) = gap, span, z
     faces = [
         quad((g0, s0, z0), (g1 - g0, 0, 0), (0, s1 - s0, 0), _CELL),

@@ -132,7 +132,7 @@ def assemble(
     description: str,
     ambient: Real = 0.78,
 ) -> World:
-    """Returns the world of a furnished model.
+    """Makes the world of a furnished model.
 
     Args:
         name: the scene's name.
@@ -187,7 +187,7 @@ def _rounded(lamps: list[Lamp]) -> tuple[Lamp, ...]:
 
 
 def ambient_occlusion(corners: np.ndarray) -> np.ndarray:
-    """Returns how much of the surroundings each corner sees, roughly.
+    """Estimates how much of the surroundings each corner sees.
 
     The scene's surfaces are splatted into voxels and blurred at two scales; a corner looks up
     the density a little in front of its face.
@@ -218,7 +218,7 @@ def ambient_occlusion(corners: np.ndarray) -> np.ndarray:
 
 
 def _splat(corners: np.ndarray, origin: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Returns voxels that any surface touches, [X, Y, Z] float32 of 0 and 1."""
+    """Marks voxels that any surface touches, [X, Y, Z] float32 of 0 and 1."""
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = 0.5 * np.linalg.norm(normal, axis=1)
     counts = np.ceil(4.0 * area / _VOXEL**2).astype(int)

@@ -32,13 +32,13 @@ class Shape:
     """[F, 3, 2] float64 [m] (or texture units, for shapes made from an atlas)."""
 
     def __add__(self, other: "Shape") -> "Shape":
-        """Returns both shapes as one."""
+        """Joins both shapes in one."""
         return Shape(
             np.concatenate([self.corners, other.corners]), np.concatenate([self.uv, other.uv])
         )
 
     def moved(self, x: Real = 0.0, y: Real = 0.0, z: Real = 0.0) -> "Shape":
-        """Returns the shape shifted by (x, y, z) [m]."""
+        """Shifts the shape by (x, y, z) [m]."""
         return Shape(self.corners + np.array([x, y, z]), self.uv)
 
     def turned(self, degrees: Real, axis: str = "z") -> "Shape":
@@ -56,14 +56,14 @@ def rotation(degrees: Real, axis: str = "z") -> np.ndarray:
 
 
 def combine(shapes: list[Shape]) -> Shape:
-    """Returns the several shapes as one."""
+    """Joins several shapes in one."""
     return Shape(
         np.concatenate([s.corners for s in shapes]), np.concatenate([s.uv for s in shapes])
     )
 
 
 def grid(points: np.ndarray, u: np.ndarray, v: np.ndarray) -> Shape:
-    """Returns a surface from a grid of points; its front is on the side of d/dcolumn x d/drow.
+    """Makes a surface from a grid of points; its front is on the side of d/dcolumn x d/drow.
 
     Args:
         points: [rows, columns, 3].
@@ -85,7 +85,7 @@ def grid(points: np.ndarray, u: np.ndarray, v: np.ndarray) -> Shape:
 
 
 def quad(origin: Point, across: Point, up: Point, step: Real = 10.0) -> Shape:
-    """Returns a rectangle from a corner and two edges; front on the side of across x up.
+    """Makes a rectangle from a corner and two edges; front on the side of across x up.
 
     It is cut into cells of at most `step` [m], for shading that varies over it.
     """
@@ -101,7 +101,7 @@ def quad(origin: Point, across: Point, up: Point, step: Real = 10.0) -> Shape:
 
 
 def box(low: Point, high: Point, upright: bool = False, step: Real = 10.0) -> Shape:
-    """Returns an axis-aligned box.
+    """Makes an axis-aligned box.
 
     Args:
         low: lower corner [m].
@@ -131,7 +131,7 @@ def _along_grain(face: Shape) -> Shape:
 
 
 def panel(x: Real, z: Real, width: Real, height: Real, y: Real = 0.0) -> Shape:
-    """Returns an upright rectangle whose front faces +y, lower corner nearest +x; [m].
+    """Makes an upright rectangle whose front faces +y, lower corner nearest +x; [m].
 
     It spans x - width / 2 .. x + width / 2 and z .. z + height.
     """
@@ -139,7 +139,7 @@ def panel(x: Real, z: Real, width: Real, height: Real, y: Real = 0.0) -> Shape:
 
 
 def disc(radius: Real, y: Real = 0.0, segments: int = 24) -> Shape:
-    """Returns an upright disc about the origin whose front faces +y; flat coordinates [m]."""
+    """Makes an upright disc about the origin whose front faces +y; flat coordinates [m]."""
     angle = np.linspace(0.0, 2.0 * np.pi, segments + 1)
     angle[-1] = 0.0
     rim = radius * np.stack([-np.cos(angle), np.sin(angle)], axis=-1)
@@ -149,7 +149,7 @@ def disc(radius: Real, y: Real = 0.0, segments: int = 24) -> Shape:
 
 
 def lathe(profile: list[tuple[Real, Real]], segments: int = 14) -> Shape:
-    """Returns a solid of revolution about z.
+    """Makes a solid of revolution about z.
 
     Args:
         profile: (radius, height) pairs from bottom to top [m].
@@ -166,13 +166,13 @@ def lathe(profile: list[tuple[Real, Real]], segments: int = 14) -> Shape:
 
 
 def cylinder(radius: Real, z0: Real, z1: Real, segments: int = 12, top: Real = -1.0) -> Shape:
-    """Returns a closed upright cylinder, or a cone when `top` gives another radius there [m]."""
+    """Makes a closed upright cylinder, or a cone when `top` gives another radius there [m]."""
     end = radius if top < 0 else top
     return lathe([(0.0, z0), (radius, z0), (end, z1), (0.0, z1)], segments)
 
 
 def ball(radii: Point, segments: int = 12, rings: int = 7, power: Real = 1.0) -> Shape:
-    """Returns an ellipsoid about the origin; `power` < 1 makes it boxy, as a cushion is.
+    """Makes an ellipsoid about the origin; `power` < 1 makes it boxy, as a cushion is.
 
     x = a sgn(c) |c|^power with c the unit sphere's coordinate (a superellipsoid).
     """
@@ -196,7 +196,7 @@ def ball(radii: Point, segments: int = 12, rings: int = 7, power: Real = 1.0) ->
 
 
 def cushion(low: Point, high: Point, power: Real = 0.42) -> Shape:
-    """Returns a soft block that fills a box: upholstery, pillows, mattresses.
+    """Makes a soft block that fills a box: upholstery, pillows, mattresses.
 
     Its texture is laid on from the six sides, as cloth is, not from the poles.
     """
@@ -210,7 +210,7 @@ def cushion(low: Point, high: Point, power: Real = 0.42) -> Shape:
 
 
 def tube(points: list[Point], radius: Real, segments: int = 5) -> Shape:
-    """Returns a round bar along a polyline, without caps [m]."""
+    """Makes a round bar along a polyline, without caps [m]."""
     path = np.array(points, dtype=np.float64)
     tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -228,7 +228,7 @@ def tube(points: list[Point], radius: Real, segments: int = 5) -> Shape:
 
 
 def curtain(width: Real, z0: Real, z1: Real, folds: int, depth: Real = 0.05) -> Shape:
-    """Returns a hanging cloth in folds along x, about y = 0, front towards +y [m]."""
+    """Makes a hanging cloth in folds along x, about y = 0, front towards +y [m]."""
     s = np.linspace(0.0, 1.0, 8 * folds + 1)
     t = np.linspace(0.0, 1.0, 5)
     swing = depth * np.sin(2 * np.pi * folds * s)[None] * (0.6 + 0.4 * (1 - t))[:, None]

@@ -23,7 +23,7 @@ from r3jax.simulators.scenes.procedural.shapes import (
 def picture(
     kind: str, seed: int, width: Real, height: Real, z: Real = 1.55, frame: Finish | None = None
 ) -> Model:
-    """Returns a framed picture, its middle at height z."""
+    """Builds a framed picture, its middle at height z."""
     finish = frame or f.wood(f.EBONY, 1)
     w, h, t = width / 2, height / 2, 0.035
     bars = [
@@ -37,7 +37,7 @@ def picture(
 
 
 def wall_mirror(width: Real, height: Real, z: Real, frame: Finish | None = None) -> Model:
-    """Returns a framed mirror, its middle at height z."""
+    """Builds a framed mirror, its middle at height z."""
     finish = frame or f.wood(f.WALNUT, 2)
     w, h = width / 2, height / 2
     model = Model().add(box((-w - 0.04, 0, z - h - 0.04), (w + 0.04, 0.025, z + h + 0.04)), finish)
@@ -45,7 +45,7 @@ def wall_mirror(width: Real, height: Real, z: Real, frame: Finish | None = None)
 
 
 def curtains(width: Real, top: Real, finish: Finish, bottom: Real = 0.04) -> Model:
-    """Returns a pair of open curtains on a rail for a window of the given width."""
+    """Builds a pair of open curtains on a rail for a window of the given width."""
     model = Model()
     rail = tube([(-width / 2 - 0.45, 0.1, top), (width / 2 + 0.45, 0.1, top)], 0.015, 8)
     model.add(rail, f.metal((0.3, 0.28, 0.26), 1))
@@ -56,7 +56,7 @@ def curtains(width: Real, top: Real, finish: Finish, bottom: Real = 0.04) -> Mod
 
 
 def radiator(width: Real = 1.0, height: Real = 0.55) -> Model:
-    """Returns a column radiator with its valve and pipe."""
+    """Builds a column radiator with its valve and pipe."""
     white, count = f.enamel(f.WHITE, 4, 0.3), max(3, round(width / 0.07))
     columns = [
         box((x - 0.026, 0.04, 0.12), (x + 0.026, 0.13, 0.12 + height))
@@ -72,21 +72,21 @@ def radiator(width: Real = 1.0, height: Real = 0.55) -> Model:
 
 
 def rug(width: Real, depth: Real, palette: tuple[Color, ...], seed: int) -> Model:
-    """Returns a rug, origin in its middle."""
+    """Builds a rug, origin in its middle."""
     sheet = quad((-width / 2, -depth / 2, 0.012), (width, 0, 0), (0, depth, 0), 0.3)
     rim = box((-width / 2, -depth / 2, 0.001), (width / 2, depth / 2, 0.0115))
     return Model().add(sheet, f.rug(palette, seed)).add(rim, f.fabric(palette[0], 1))
 
 
 def clock(seed: int, z: Real = 2.0, radius: Real = 0.17) -> Model:
-    """Returns a round wall clock, its middle at height z."""
+    """Builds a round wall clock, its middle at height z."""
     case = cylinder(radius, 0.0, 0.035, 24).turned(-90.0, "x").moved(z=z)
     model = Model().add(case, f.enamel(f.CHARCOAL, 1))
     return model.add(disc(0.92 * radius, 0.037).moved(z=z), f.clock_face(seed))
 
 
 def board(kind: str, width: Real, height: Real, z: Real, seed: int) -> Model:
-    """Returns a framed "white" or "black" board with a tray, its middle at height z."""
+    """Builds a framed "white" or "black" board with a tray, its middle at height z."""
     w, h = width / 2, height / 2
     frame = f.metal((0.75, 0.75, 0.76), 1) if kind == "white" else f.wood(f.OAK, 1)
     model = Model().add(box((-w - 0.03, 0, z - h - 0.03), (w + 0.03, 0.02, z + h + 0.03)), frame)
@@ -95,7 +95,7 @@ def board(kind: str, width: Real, height: Real, z: Real, seed: int) -> Model:
 
 
 def picture_group(seed: int, z: Real = 1.6) -> Model:
-    """Returns the five small pictures hung as a cloud, about 1.7 m wide."""
+    """Builds five small pictures hung as a cloud, about 1.7 m wide."""
     model = Model()
     kinds = ("poster", "landscape", "abstract", "sunset", "abstract")
     spots = (
@@ -112,7 +112,7 @@ def picture_group(seed: int, z: Real = 1.6) -> Model:
 
 
 def wall_shelf(width: Real, z: Real, things: list[Model]) -> Model:
-    """Returns a board on brackets with things spread over it."""
+    """Builds a board on brackets with things spread over it."""
     model = Model().add(box((-width / 2, 0, z - 0.03), (width / 2, 0.24, z)), f.wood(f.OAK, 2))
     for x in (-width / 2 + 0.15, width / 2 - 0.15):
         model.add(

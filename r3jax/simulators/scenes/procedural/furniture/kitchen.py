@@ -40,9 +40,9 @@ def _front(model: Model, x0: Real, x1: Real, z0: Real, z1: Real, y: Real, finish
 def kitchen_run(
     width: Real, front: Finish, top: Finish, splash: Finish, seed: int, uppers: bool = True
 ) -> Model:
-    """Returns a kitchen along a wall.
+    """Builds a kitchen along a wall.
 
-    Units, worktop, sink, hob and oven, splashback, wall cupboards.
+    It has units, a worktop, sink, hob and oven, a splashback and wall cupboards.
     """
     w, model = width / 2, Model()
     model.add(box((-w, 0, 0.1), (w, 0.56, 0.87)), front)
@@ -141,7 +141,7 @@ def _worktop_things(model: Model, width: Real, pitch: Real, seed: int) -> None:
 
 
 def fridge(seed: int) -> Model:
-    """Returns a tall refrigerator with notes on its door."""
+    """Builds a tall refrigerator with notes on its door."""
     steel = f.metal((0.78, 0.79, 0.8), 2, 0.12)
     model = Model().add(box((-0.3, 0, 0.03), (0.3, 0.6, 1.85)), steel)
     for z0, z1 in ((0.06, 0.66), (0.68, 1.84)):
@@ -166,7 +166,7 @@ def fridge(seed: int) -> Model:
 
 
 def island(width: Real, front: Finish, top: Finish, seed: int) -> Model:
-    """Returns a kitchen island, origin in its middle, with fruit, bottles and a plant."""
+    """Builds a kitchen island, origin in its middle, with fruit, bottles and a plant."""
     w, model = width / 2, Model()
     model.add(box((-w, -0.35, 0), (w, 0.35, 0.87), upright=True, step=0.5), front)
     model.add(box((-w - 0.05, -0.42, 0.87), (w + 0.05, 0.42, 0.92), step=0.5), top)
@@ -186,7 +186,7 @@ def kitchen_shelf(seed: int, width: Real = 1.2) -> list[Model]:
 
 
 def toilet() -> Model:
-    """Returns a floor-standing toilet with a cistern and a lid, and paper beside it."""
+    """Builds a floor-standing toilet with a cistern and a lid, and paper beside it."""
     white = f.enamel((0.93, 0.93, 0.92), 6, 0.8)
     model = Model().add(cushion((-0.2, 0.0, 0.4), (0.2, 0.2, 0.82), 0.2), white)
     bowl = lathe([(0.0, 0.0), (0.12, 0.0), (0.1, 0.15), (0.19, 0.36), (0.2, 0.41), (0.0, 0.42)], 20)
@@ -198,7 +198,7 @@ def toilet() -> Model:
 
 
 def washbasin(width: Real, front: Finish, seed: int) -> Model:
-    """Returns a basin on a cabinet under a mirror with a lamp; bottles and a towel."""
+    """Builds a basin on a cabinet under a mirror with a lamp; bottles and a towel."""
     w, white = width / 2, f.enamel((0.93, 0.93, 0.92), 6, 0.8)
     model = Model().add(box((-w, 0, 0.3), (w, 0.44, 0.78)), front)
     for x0, x1 in ((-w, 0.0), (0.0, w)):
@@ -223,7 +223,7 @@ def washbasin(width: Real, front: Finish, seed: int) -> Model:
 
 
 def bathtub(length: Real = 1.7) -> Model:
-    """Returns a tub along the wall with a printed shower curtain half drawn."""
+    """Builds a tub along the wall with a printed shower curtain half drawn."""
     white, w = f.enamel((0.93, 0.93, 0.92), 6, 0.8), length / 2
     model = Model().add(
         box((-w, 0.7, 0), (w, 0.75, 0.56), upright=True),
@@ -258,7 +258,7 @@ def bathtub(length: Real = 1.7) -> Model:
 
 
 def towel_rail(seed: int) -> Model:
-    """Returns a ladder rail with two folded towels."""
+    """Builds a ladder rail with two folded towels."""
     steel, model = f.metal(), Model()
     for x in (-0.25, 0.25):
         model.add(tube([(x, 0.07, 0.6), (x, 0.07, 1.75)], 0.015, 8), steel)
@@ -274,7 +274,7 @@ def towel_rail(seed: int) -> Model:
 
 
 def washing_machine() -> Model:
-    """Returns a front loader with a box of powder on top."""
+    """Builds a front loader with a box of powder on top."""
     white = f.enamel(f.WHITE, 7, 0.5)
     model = Model().add(box((-0.3, 0, 0), (0.3, 0.58, 0.85)), white)
     ring = cylinder(0.19, 0, 0.03, 24, 0.17).turned(-90.0, "x")

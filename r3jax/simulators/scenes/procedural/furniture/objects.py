@@ -67,7 +67,7 @@ def book_row(length: Real, height: Real, depth: Real, seed: int, thickness: Real
 
 
 def book_pile(count: int, seed: int) -> Model:
-    """Returns a pile of lying books, spines about +y."""
+    """Builds a pile of lying books, spines about +y."""
     rng = np.random.default_rng(seed)
     model, z = Model(), 0.0
     for _ in range(count):
@@ -84,7 +84,7 @@ def book_pile(count: int, seed: int) -> Model:
 
 
 def vase(seed: int, height: Real = 0.28) -> Model:
-    """Returns a turned vase; every second one is glazed in two colors."""
+    """Builds a turned vase; every second one is glazed in two colors."""
     rng = np.random.default_rng(seed)
     t = np.linspace(0.0, 1.0, 9)
     belly = 0.3 + 0.22 * np.sin(np.pi * (t * (0.8 + 0.5 * rng.random())) + 0.6 * rng.random())
@@ -100,7 +100,7 @@ def vase(seed: int, height: Real = 0.28) -> Model:
 
 
 def bowl_of_fruit(seed: int) -> Model:
-    """Returns a wooden bowl of oranges, apples and lemons."""
+    """Builds a wooden bowl of oranges, apples and lemons."""
     rng = np.random.default_rng(seed)
     bowl = lathe(
         [(0.0, 0.0), (0.06, 0.0), (0.14, 0.06), (0.16, 0.09), (0.15, 0.09), (0.1, 0.04), (0, 0.03)],
@@ -122,7 +122,7 @@ def bowl_of_fruit(seed: int) -> Model:
 
 
 def leafy_plant(height: Real, seed: int, leaves: int = 34, broad: Real = 0.3) -> Model:
-    """Returns a pot plant with arching leaves; `broad` is the width of a leaf over its length."""
+    """Builds a pot plant with arching leaves; `broad` is the width of a leaf over its length."""
     rng = np.random.default_rng(seed)
     pot = 0.13 * height + 0.04
     outside = [(0.0, 0.0), (0.75, 0.0), (1.0, 1.5), (1.06, 1.6), (0.9, 1.6)]
@@ -157,7 +157,7 @@ def leafy_plant(height: Real, seed: int, leaves: int = 34, broad: Real = 0.3) ->
 
 
 def _blade(length: Real, broad: Real, lift: Real) -> Shape:
-    """Returns a leaf that starts at the origin along +x, rises and bends down; unit coordinates."""
+    """Makes a leaf that starts at the origin along +x, rises and bends down; unit coordinates."""
     t = np.linspace(0.0, 1.0, 6)
     angle = lift - 1.5 * t**1.5
     step = length / 5
@@ -173,7 +173,7 @@ def _blade(length: Real, broad: Real, lift: Real) -> Shape:
 
 
 def table_lamp(seed: int, height: Real = 0.45) -> Model:
-    """Returns a lamp with a cloth shade that glows and lights its surroundings."""
+    """Builds a lamp with a cloth shade that glows and lights its surroundings."""
     color = _BRIGHT[seed % len(_BRIGHT)]
     foot = lathe(
         [(0.0, 0.0), (0.08, 0.0), (0.08, 0.02), (0.025, 0.05), (0.05, 0.14), (0.02, 0.55 * height)],
@@ -186,7 +186,7 @@ def table_lamp(seed: int, height: Real = 0.45) -> Model:
 
 
 def floor_lamp(seed: int) -> Model:
-    """Returns a standing lamp, 1.6 m, with a drum shade."""
+    """Builds a standing lamp, 1.6 m, with a drum shade."""
     model = Model().add(cylinder(0.15, 0.0, 0.025, 18), f.metal((0.35, 0.34, 0.33), 1))
     model.add(cylinder(0.014, 0.025, 1.35, 8), f.metal((0.35, 0.34, 0.33), 1))
     tint = ((0.98, 0.9, 0.74), (0.97, 0.84, 0.66))[seed % 2]
@@ -197,7 +197,7 @@ def floor_lamp(seed: int) -> Model:
 def pendant(
     ceiling: Real, drop: Real = 0.55, radius: Real = 0.22, seed: int = 0, reach: Real = 2.4
 ) -> Model:
-    """Returns a hanging lamp: cord, dome, glowing bulb. Origin on the floor below it."""
+    """Builds a hanging lamp: cord, dome, glowing bulb. Origin on the floor below it."""
     top = ceiling - drop
     model = Model().add(
         tube([(0, 0, ceiling), (0, 0, top + 0.2)], 0.006, 5), f.enamel(f.CHARCOAL, 1)
@@ -216,7 +216,7 @@ def pendant(
 
 
 def ceiling_panel(ceiling: Real, width: Real = 1.2, depth: Real = 0.3, reach: Real = 2.6) -> Model:
-    """Returns a fluorescent panel under the ceiling. Origin on the floor below its middle."""
+    """Builds a fluorescent panel under the ceiling. Origin on the floor below its middle."""
     w, d = width / 2, depth / 2
     model = Model().add(
         box((-w, -d, ceiling - 0.06), (w, d, ceiling)), f.metal((0.8, 0.8, 0.8), 2, 0.05)
@@ -227,19 +227,19 @@ def ceiling_panel(ceiling: Real, width: Real = 1.2, depth: Real = 0.3, reach: Re
 
 
 def carton(seed: int, width: Real = 0.12, depth: Real = 0.08, height: Real = 0.2) -> Model:
-    """Returns a printed carton."""
+    """Builds a printed carton."""
     return Model().add(_six_prints(width, depth, height), f.package(seed % 12), atlas=True)
 
 
 def _six_prints(w: Real, d: Real, h: Real) -> Shape:
-    """Returns a box whose every face shows the whole print; unit coordinates."""
+    """Makes a box whose every face shows the whole print; unit coordinates."""
     shape = box((-w / 2, -d / 2, 0), (w / 2, d / 2, h), upright=True)
     uv = shape.uv.reshape(6, -1, 3, 2)
     return Shape(shape.corners, (uv / uv.max(axis=(1, 2), keepdims=True)).reshape(-1, 3, 2))
 
 
 def jar(seed: int, radius: Real = 0.045, height: Real = 0.16) -> Model:
-    """Returns a tin or jar with a printed label and a lid."""
+    """Builds a tin or jar with a printed label and a lid."""
     body = lathe([(radius, 0.0), (radius, height)], 14)
     model = Model().add(body, f.package((seed + 5) % 12))
     lid = [(1.04 * radius, height), (1.04 * radius, 1.12 * height), (0.0, 1.13 * height)]
@@ -247,7 +247,7 @@ def jar(seed: int, radius: Real = 0.045, height: Real = 0.16) -> Model:
 
 
 def bottle(seed: int, height: Real = 0.3) -> Model:
-    """Returns a glazed bottle with a label."""
+    """Builds a glazed bottle with a label."""
     r = 0.13 * height
     profile = [
         (0, 0),
@@ -266,7 +266,7 @@ def bottle(seed: int, height: Real = 0.3) -> Model:
 
 
 def crockery(seed: int) -> Model:
-    """Returns a place setting: plate, bowl, mug."""
+    """Builds a place setting: plate, bowl, mug."""
     white, color = f.enamel(f.WHITE, 5, 0.7), f.enamel(_BRIGHT[seed % len(_BRIGHT)], 2, 0.6)
     plate = lathe([(0.0, 0.004), (0.08, 0.004), (0.13, 0.02), (0.13, 0.014), (0.08, 0.0)], 16)
     bowl = lathe([(0.04, 0.012), (0.075, 0.06), (0.07, 0.06), (0.03, 0.02), (0.0, 0.02)], 12)
@@ -279,7 +279,7 @@ def crockery(seed: int) -> Model:
 
 
 def clutter(seed: int) -> Model:
-    """Returns one small thing, chosen by the seed: for shelves."""
+    """Builds one small thing, chosen by the seed: for shelves."""
     makers = (
         lambda: vase(seed, 0.16 + 0.02 * (seed % 5)),
         lambda: book_pile(3 + seed % 3, seed),
@@ -297,7 +297,7 @@ def clutter(seed: int) -> Model:
 
 
 def standing_frame(seed: int) -> Model:
-    """Returns a small framed photograph that leans back a little."""
+    """Builds a small framed photograph that leans back a little."""
     model = Model().add(box((-0.08, -0.01, 0), (0.08, 0.005, 0.2)), f.wood(f.EBONY, 1))
     model.add(
         panel(0, 0.012, 0.136, 0.176, 0.006),

@@ -27,7 +27,7 @@ def _legs(width: Real, depth: Real, height: Real, finish: Finish, thick: Real = 
 
 
 def sofa(width: Real, cloth: Finish, accents: tuple[Finish, ...], seed: int = 0) -> Model:
-    """Returns a sofa with seat, back and loose cushions; 0.9 m deep, back on y = 0."""
+    """Builds a sofa with seat, back and loose cushions; 0.9 m deep, back on y = 0."""
     arm, seats = 0.18, max(1, round((width - 0.36) / 0.75))
     model = Model().put(_legs(width - 0.1, 0.75, 0.12, f.wood(f.WALNUT, 2)), 0, 0.45)
     model.add(box((-width / 2 + 0.04, 0.03, 0.1), (width / 2 - 0.04, 0.86, 0.28)), cloth)
@@ -51,14 +51,14 @@ def sofa(width: Real, cloth: Finish, accents: tuple[Finish, ...], seed: int = 0)
 
 
 def armchair(cloth: Finish, accent: Finish) -> Model:
-    """Returns a small sofa for one with a blanket over its arm."""
+    """Builds a small sofa for one with a blanket over its arm."""
     model = sofa(0.95, cloth, (accent,))
     throw = drape((0.29, 0.2, 0.0), (0.48, 0.75, 0.625), 0.28)
     return model.add(throw, f.plaid(f.CREAM, f.TERRACOTTA, f.CHARCOAL, 2))
 
 
 def chair(wood: Finish, seat: Finish) -> Model:
-    """Returns a dining chair, origin in its middle, front towards +y."""
+    """Builds a dining chair, origin in its middle, front towards +y."""
     model = Model().put(_legs(0.44, 0.44, 0.44, wood, 0.05))
     model.add(cushion((-0.22, -0.21, 0.42), (0.22, 0.23, 0.5), 0.3), seat)
     for x in (-0.19, 0.19):
@@ -70,7 +70,7 @@ def chair(wood: Finish, seat: Finish) -> Model:
 
 
 def stool(wood: Finish, height: Real = 0.65) -> Model:
-    """Returns a bar stool with a foot ring."""
+    """Builds a bar stool with a foot ring."""
     model = Model().put(_legs(0.34, 0.34, height - 0.04, wood))
     model.add(cylinder(0.18, height - 0.04, height, 18), wood)
     ring = [(0.15 * np.cos(a), 0.15 * np.sin(a), 0.22) for a in np.linspace(0, 2 * np.pi, 13)]
@@ -78,7 +78,7 @@ def stool(wood: Finish, height: Real = 0.65) -> Model:
 
 
 def table(width: Real, depth: Real, wood: Finish, height: Real = 0.74) -> Model:
-    """Returns a four-legged table, origin in its middle."""
+    """Builds a four-legged table, origin in its middle."""
     model = Model()
     model.add(
         box((-width / 2, -depth / 2, height - 0.035), (width / 2, depth / 2, height), step=0.4),
@@ -93,7 +93,7 @@ def table(width: Real, depth: Real, wood: Finish, height: Real = 0.74) -> Model:
 
 
 def dining_set(width: Real, depth: Real, wood: Finish, seat: Finish, seed: int) -> Model:
-    """Returns a laid table with chairs on both long sides."""
+    """Builds a laid table with chairs on both long sides."""
     rng = np.random.default_rng(seed)
     model = Model().put(table(width, depth, wood))
     runner = drape((-0.18, -depth / 2, 0.0), (0.18, depth / 2, 0.74), 0.001, 0.0)
@@ -110,7 +110,7 @@ def dining_set(width: Real, depth: Real, wood: Finish, seat: Finish, seed: int) 
 
 
 def coffee_table(wood: Finish, seed: int, width: Real = 1.0) -> Model:
-    """Returns a low table with books, a bowl and a cup; origin in its middle."""
+    """Builds a low table with books, a bowl and a cup; origin in its middle."""
     model = Model().put(table(width, 0.55, wood, 0.4))
     model.add(box((-width / 2 + 0.08, -0.2, 0.14), (width / 2 - 0.08, 0.2, 0.16)), wood)
     model.put(objects.book_pile(4, seed), -0.25 * width, 0.02, 0.4, 20.0)
@@ -120,7 +120,7 @@ def coffee_table(wood: Finish, seed: int, width: Real = 1.0) -> Model:
 
 
 def bed(width: Real, cover: Finish, throw: Finish, wood: Finish, length: Real = 2.0) -> Model:
-    """Returns a bed with mattress, duvet, throw and pillows; head on y = 0."""
+    """Builds a bed with mattress, duvet, throw and pillows; head on y = 0."""
     w, model = width / 2, Model()
     model.add(box((-w - 0.05, 0, 0), (w + 0.05, 0.06, 1.05), step=0.5), wood)
     model.add(box((-w - 0.03, 0.06, 0.1), (w + 0.03, length + 0.04, 0.3)), wood)
@@ -139,14 +139,14 @@ def bed(width: Real, cover: Finish, throw: Finish, wood: Finish, length: Real = 
 
 
 def bench(width: Real, wood: Finish, cloth: Finish) -> Model:
-    """Returns an upholstered bench, origin in its middle."""
+    """Builds an upholstered bench, origin in its middle."""
     model = Model().put(_legs(width, 0.42, 0.36, wood))
     model.add(box((-width / 2, -0.2, 0.34), (width / 2, 0.2, 0.38)), wood)
     return model.add(cushion((-width / 2, -0.21, 0.37), (width / 2, 0.21, 0.46), 0.25), cloth)
 
 
 def office_chair(cloth: Finish) -> Model:
-    """Returns a swivel chair on five castors, origin in its middle, front towards +y."""
+    """Builds a swivel chair on five castors, origin in its middle, front towards +y."""
     dark = f.enamel(f.CHARCOAL, 1)
     arms = [
         tube([(0, 0, 0.1), (0.3 * np.cos(a), 0.3 * np.sin(a), 0.06)], 0.02)
@@ -169,7 +169,7 @@ def office_chair(cloth: Finish) -> Model:
 
 
 def plinth_sculpture(seed: int, stone: Finish) -> Model:
-    """Returns a turned or knotted sculpture on a plinth, origin in its middle."""
+    """Builds a turned or knotted sculpture on a plinth, origin in its middle."""
     model = Model().add(
         box((-0.2, -0.2, 0), (0.2, 0.2, 0.95), upright=True, step=0.3),
         f.concrete((0.82, 0.81, 0.79), 12),

@@ -45,7 +45,7 @@ def bookshelf(
 def library_shelf(
     width: Real, height: Real, wood: Finish, seed: int, thickness: Real = 1.0
 ) -> Model:
-    """Returns two bookshelves back to back, origin in the middle, with end panels."""
+    """Builds two bookshelves back to back, origin in the middle, with end panels."""
     model = Model()
     model.put(bookshelf(width, height, wood, seed, 0.28, thickness), 0, 0.01, 0, "n")
     model.put(bookshelf(width, height, wood, seed + 1, 0.28, thickness), 0, -0.01, 0, "s")
@@ -65,7 +65,7 @@ def _handle(x: Real, z: Real, y: Real, length: Real = 0.14, upright: bool = True
 
 
 def wardrobe(width: Real, height: Real, wood: Finish, mirror: bool = True) -> Model:
-    """Returns a wardrobe with panelled doors; one of them may carry a mirror. 0.6 m deep."""
+    """Builds a wardrobe with panelled doors; one of them may carry a mirror. 0.6 m deep."""
     model = Model().add(box((-width / 2, 0, 0), (width / 2, 0.57, height), step=0.5), wood)
     doors = max(2, round(width / 0.5))
     pitch = width / doors
@@ -85,7 +85,7 @@ def wardrobe(width: Real, height: Real, wood: Finish, mirror: bool = True) -> Mo
 def drawers(
     width: Real, height: Real, depth: Real, finish: Finish, columns: int, rows: int
 ) -> Model:
-    """Returns a chest of drawers (or a sideboard) on a plinth."""
+    """Builds a chest of drawers (or a sideboard) on a plinth."""
     w = width / 2
     model = Model().add(box((-w, 0, 0.07), (w, depth, height), step=0.5), finish)
     model.add(box((-w + 0.03, 0.03, 0), (w - 0.03, depth - 0.05, 0.07)), f.wood(f.EBONY, 1))
@@ -104,7 +104,7 @@ def drawers(
 
 
 def sideboard(width: Real, wood: Finish, seed: int) -> Model:
-    """Returns a sideboard with a lamp and things on it."""
+    """Builds a sideboard with a lamp and things on it."""
     model = Model().put(drawers(width, 0.8, 0.42, wood, max(2, round(width / 0.5)), 3))
     model.put(objects.table_lamp(seed), -width / 2 + 0.25, 0.2, 0.8)
     things = (
@@ -119,14 +119,14 @@ def sideboard(width: Real, wood: Finish, seed: int) -> Model:
 
 
 def nightstand(wood: Finish, seed: int) -> Model:
-    """Returns a bedside table with a lamp and books."""
+    """Builds a bedside table with a lamp and books."""
     model = Model().put(drawers(0.45, 0.5, 0.38, wood, 1, 2))
     model.put(objects.table_lamp(seed, 0.4), -0.08, 0.16, 0.5)
     return model.put(objects.book_pile(2, seed), 0.1, 0.26, 0.5, 10.0)
 
 
 def television_unit(width: Real, wood: Finish, seed: int) -> Model:
-    """Returns a low unit with a large screen, speakers and boxes."""
+    """Builds a low unit with a large screen, speakers and boxes."""
     model = Model().put(drawers(width, 0.45, 0.4, wood, 3, 1))
     dark = f.enamel(f.CHARCOAL, 2, 0.5)
     model.add(box((-0.62, 0.12, 0.55), (0.62, 0.16, 1.27)), dark)
@@ -142,7 +142,7 @@ def television_unit(width: Real, wood: Finish, seed: int) -> Model:
 
 
 def monitor(seed: int, width: Real = 0.55) -> Model:
-    """Returns a monitor on its foot; screen towards +y, origin below it."""
+    """Builds a monitor on its foot; screen towards +y, origin below it."""
     dark, w = f.enamel(f.CHARCOAL, 2, 0.4), width / 2
     model = Model().add(box((-0.12, -0.08, 0), (0.12, 0.08, 0.012)), dark)
     model.add(box((-0.025, -0.045, 0.01), (0.025, -0.025, 0.3)), dark)
@@ -151,9 +151,9 @@ def monitor(seed: int, width: Real = 0.55) -> Model:
 
 
 def desk(width: Real, wood: Finish, seed: int, monitors: int = 1) -> Model:
-    """Returns a desk against a wall.
+    """Builds a desk against a wall, 0.75 m deep.
 
-    Monitors, keyboard, papers, pots, a drawer block. 0.75 m deep.
+    It carries monitors, a keyboard, papers, pots and a drawer block.
     """
     w, rng = width / 2, np.random.default_rng(seed)
     model = Model().add(box((-w, 0, 0.71), (w, 0.75, 0.74), step=0.4), wood)

@@ -18,7 +18,7 @@ from r3jax.simulators.scenes.procedural.shapes import (
 
 
 def glass_partition(width: Real, height: Real) -> Model:
-    """Returns a framed glass wall, 8 cm thick, in its middle plane y = 0.
+    """Builds a framed glass wall, 8 cm thick, in its middle plane y = 0.
 
     The panes between the posts are clear glass (no depth there, half a mirror) with an etched
     band at half height, as is required where people could walk into them.
@@ -45,7 +45,7 @@ def glass_partition(width: Real, height: Real) -> Model:
 
 
 def workstation(seed: int, width: Real = 1.5) -> Model:
-    """Returns a desk with a chair, monitors and personal things."""
+    """Builds a desk with a chair, monitors and personal things."""
     model = storage.desk(
         width, f.wood(f.BEECH if seed % 2 else f.OAK, seed % 3), seed, 1 + seed % 2
     )
@@ -67,7 +67,7 @@ def desk_island(pairs: int, seed: int) -> Model:
 
 
 def meeting_table(width: Real, depth: Real, seats: int, seed: int) -> Model:
-    """Returns a conference table with swivel chairs, papers, cups and a conference phone."""
+    """Builds a conference table with swivel chairs, papers, cups and a conference phone."""
     model = Model().put(seating.table(width, depth, f.wood(f.WALNUT, 4, 0.35), 0.74))
     for k in range(seats):
         x = (k + 0.5) * width / seats - width / 2
@@ -86,7 +86,7 @@ def meeting_table(width: Real, depth: Real, seats: int, seed: int) -> Model:
 
 
 def filing_cabinet(seed: int) -> Model:
-    """Returns a steel cabinet with boxes and a plant on it."""
+    """Builds a steel cabinet with boxes and a plant on it."""
     color = (f.SAGE, (0.55, 0.57, 0.6), f.MUSTARD)[seed % 3]
     model = Model().put(storage.drawers(0.8, 1.15, 0.45, f.enamel(color, 4, 0.3), 1, 4))
     model.put(objects.carton(seed, 0.3, 0.25, 0.26), -0.2, 0.2, 1.15, 6.0)
@@ -94,7 +94,7 @@ def filing_cabinet(seed: int) -> Model:
 
 
 def copier() -> Model:
-    """Returns a floor-standing copier."""
+    """Builds a floor-standing copier."""
     white, dark = f.enamel((0.86, 0.86, 0.84), 5, 0.3), f.enamel(f.CHARCOAL, 2, 0.4)
     model = Model().add(box((-0.3, 0.02, 0.04), (0.3, 0.62, 0.82)), white)
     model.add(box((-0.32, 0, 0.82), (0.32, 0.6, 0.9)), dark)
@@ -107,14 +107,14 @@ def copier() -> Model:
 
 
 def water_cooler() -> Model:
-    """Returns a water cooler with its bottle."""
+    """Builds a water cooler with its bottle."""
     model = Model().add(box((-0.16, 0.02, 0), (0.16, 0.34, 1.0)), f.enamel(f.WHITE, 6, 0.4))
     model.add(cylinder(0.13, 1.0, 1.36, 18).moved(0, 0.18), f.enamel((0.45, 0.65, 0.8), 3, 0.9))
     return model.add(panel(0, 0.62, 0.24, 0.25, 0.342), f.package(3))
 
 
 def school_desk(seed: int) -> Model:
-    """Returns a desk for two with chairs, books and pencils; origin in its middle.
+    """Builds a desk for two with chairs, books and pencils; origin in its middle.
 
     The pupils sit on the +y side and look towards -y.
     """
@@ -133,7 +133,7 @@ def school_desk(seed: int) -> Model:
 
 
 def globe(seed: int) -> Model:
-    """Returns a globe on a stand."""
+    """Builds a globe on a stand."""
     model = Model().add(cylinder(0.1, 0, 0.03, 16), f.wood(f.WALNUT, 2))
     model.add(tube([(0, 0, 0.03), (0, 0, 0.12)], 0.012), f.metal((0.7, 0.58, 0.35), 2))
     sphere = ball((0.15, 0.15, 0.15), 18, 12).turned(23.0, "x").moved(z=0.27)
@@ -141,7 +141,7 @@ def globe(seed: int) -> Model:
 
 
 def spotlight_rail(length: Real, ceiling: Real, count: int, reach: Real = 2.2) -> Model:
-    """Returns a rail along x under the ceiling with spotlights that shine on what is below."""
+    """Builds a rail along x under the ceiling with spotlights that shine on what is below."""
     dark = f.enamel(f.CHARCOAL, 1)
     model = Model().add(
         box((-length / 2, -0.02, ceiling - 0.04), (length / 2, 0.02, ceiling)), dark
@@ -156,7 +156,7 @@ def spotlight_rail(length: Real, ceiling: Real, count: int, reach: Real = 2.2) -
 
 
 def lectern(wood: Finish) -> Model:
-    """Returns a teacher's desk with a globe, books and a chair behind it; front towards +y."""
+    """Builds a teacher's desk with a globe, books and a chair behind it; front towards +y."""
     model = Model().put(storage.drawers(0.45, 0.7, 0.55, wood, 1, 3), -0.5, -0.3)
     model.put(seating.table(1.5, 0.7, wood, 0.76))
     model.put(globe(1), 0.55, 0.1, 0.76)

@@ -42,13 +42,13 @@ PALETTES = (
 
 
 def ink(color: Color | np.ndarray, shade: Real = 1.0) -> Ink:
-    """Returns a color in [0, 1] as the bytes that Pillow draws with."""
+    """Converts a color in [0, 1] to the bytes that Pillow draws with."""
     r, g, b = (int(255 * min(1.0, max(0.0, c * shade))) for c in color)
     return r, g, b
 
 
 def to_float(image: Image.Image) -> np.ndarray:
-    """Returns a Pillow image as [h, w, 3] float32 in [0, 1]."""
+    """Converts a Pillow image to [h, w, 3] float32 in [0, 1]."""
     return np.asarray(image.convert("RGB"), dtype=np.float32) / 255.0
 
 
@@ -94,7 +94,7 @@ _MOODS = (
 
 
 def _scene(seed: int, height: int, width: int, sunset: Real) -> np.ndarray:
-    """Returns the sky, clouds, four ranges of hills, a plain with trees; [h, w, 3] float32."""
+    """Paints sky, clouds, four ranges of hills, a plain with trees; [h, w, 3] float32."""
     rng = np.random.default_rng(seed)
     row, column = np.mgrid[0:height, 0:width].astype(np.float32)
     y = row / height
@@ -146,7 +146,7 @@ def _trees(image: np.ndarray, seed: int, count: int) -> np.ndarray:
 
 @functools.cache
 def landscape(seed: int, height: int = 384, width: int = 512, sunset: Real = 0.3) -> np.ndarray:
-    """Returns a painted landscape with brush marks."""
+    """Paints a landscape with brush marks."""
     image = _trees(_scene(seed, height, width, sunset), seed, 14)
     brush = 0.06 * cloud(height, width, seed + 40, 0.6, 3.0) + 0.03 * cloud(height, width, 41, 0.2)
     return texels(image * (1.0 + brush)[..., None])
@@ -154,7 +154,7 @@ def landscape(seed: int, height: int = 384, width: int = 512, sunset: Real = 0.3
 
 @functools.cache
 def window_view(seed: int, height: int = 512, width: int = 512) -> np.ndarray:
-    """Returns what is outside: sky, hills and a street of houses with lit windows."""
+    """Paints the view outside: sky, hills and a street of houses with lit windows."""
     rng = np.random.default_rng(seed)
     canvas = Image.fromarray(texels(_trees(_scene(seed, height, width, 0.15), seed, 10)))
     draw = ImageDraw.Draw(canvas)
@@ -189,7 +189,7 @@ def _hedge(canvas: Image.Image, rng: np.random.Generator) -> Image.Image:
 
 @functools.cache
 def abstract(seed: int, height: int = 512, width: int = 384) -> np.ndarray:
-    """Returns an abstract print: overlapping discs, bars, arcs and lines on a textured ground."""
+    """Paints an abstract print: overlapping discs, bars, arcs and lines on a textured ground."""
     rng = np.random.default_rng(seed)
     palette = PALETTES[seed % len(PALETTES)]
     canvas = Image.new("RGB", (width, height), ink(palette[4]))
@@ -219,7 +219,7 @@ def abstract(seed: int, height: int = 512, width: int = 384) -> np.ndarray:
 
 @functools.cache
 def poster(seed: int, height: int = 512, width: int = 384) -> np.ndarray:
-    """Returns a printed poster: a picture, a headline and columns of print."""
+    """Paints a poster: a picture, a headline and columns of print."""
     rng = np.random.default_rng(seed)
     palette = PALETTES[(seed + 1) % len(PALETTES)]
     canvas = Image.new("RGB", (width, height), ink(palette[(seed // 4) % 5]))
@@ -242,7 +242,7 @@ SPINES = 32
 
 @functools.cache
 def desktop(seed: int, height: int = 320, width: int = 512) -> np.ndarray:
-    """Returns a computer screen: wallpaper, an editor, a chart, a bar of icons."""
+    """Paints a computer screen: wallpaper, an editor, a chart, a bar of icons."""
     rng = np.random.default_rng(seed)
     canvas = Image.fromarray(landscape(seed, height, width, 0.7))
     draw = ImageDraw.Draw(canvas)
@@ -275,7 +275,7 @@ def desktop(seed: int, height: int = 320, width: int = 512) -> np.ndarray:
 
 @functools.cache
 def whiteboard(seed: int, height: int = 512, width: int = 1024) -> np.ndarray:
-    """Returns a whiteboard with boxes, arrows, curves, notes and half-wiped smears."""
+    """Paints a whiteboard with boxes, arrows, curves, notes and half-wiped smears."""
     return _board(
         seed,
         height,
@@ -287,7 +287,7 @@ def whiteboard(seed: int, height: int = 512, width: int = 1024) -> np.ndarray:
 
 @functools.cache
 def blackboard(seed: int, height: int = 512, width: int = 1024) -> np.ndarray:
-    """Returns a green chalkboard in use."""
+    """Paints a green chalkboard in use."""
     return _board(
         seed,
         height,
@@ -333,14 +333,14 @@ def _board(
 
 
 def ridge_line(rng: np.random.Generator, num: int) -> np.ndarray:
-    """Returns a short random curve with mean 0, [num]."""
+    """Draws a short random curve with mean 0, [num]."""
     line = np.cumsum(rng.normal(size=num))
     return (line - line.mean()) / max(float(np.abs(line).max()), 1e-6)
 
 
 @functools.cache
 def book_spines(seed: int, height: int = 256, width: int = 1024) -> np.ndarray:
-    """Returns an atlas of `SPINES` book spines side by side: bands, titles, emblems."""
+    """Paints an atlas of `SPINES` book spines side by side: bands, titles, emblems."""
     rng = np.random.default_rng(seed)
     canvas = Image.new("RGB", (width, height))
     draw = ImageDraw.Draw(canvas)
@@ -366,7 +366,7 @@ def book_spines(seed: int, height: int = 256, width: int = 1024) -> np.ndarray:
 
 @functools.cache
 def package(seed: int, height: int = 192, width: int = 128) -> np.ndarray:
-    """Returns the front of a carton, tin or jar: a badge, a headline, small print."""
+    """Paints the front of a carton, tin or jar: a badge, a headline, small print."""
     rng = np.random.default_rng(seed)
     palette = PALETTES[seed % 4]
     canvas = Image.new("RGB", (width, height), ink(palette[(seed // 4) % 5]))
@@ -387,7 +387,7 @@ def package(seed: int, height: int = 192, width: int = 128) -> np.ndarray:
 
 @functools.cache
 def clock(seed: int, size: int = 256) -> np.ndarray:
-    """Returns a clock's dial."""
+    """Paints a clock's dial."""
     canvas = Image.new("RGB", (size, size), (238, 234, 222))
     draw = ImageDraw.Draw(canvas)
     c = size / 2
@@ -407,7 +407,7 @@ def clock(seed: int, size: int = 256) -> np.ndarray:
 
 @functools.cache
 def keyboard(height: int = 128, width: int = 384) -> np.ndarray:
-    """Returns a keyboard from above."""
+    """Paints a keyboard from above."""
     canvas = Image.new("RGB", (width, height), (38, 40, 44))
     draw = ImageDraw.Draw(canvas)
     for i in range(5):

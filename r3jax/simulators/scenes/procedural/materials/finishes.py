@@ -50,19 +50,19 @@ def wallpaper(ground: Color, inks: tuple[Color, ...], motif: str, seed: int) -> 
 
 @functools.cache
 def concrete(color: Color, seed: int) -> Finish:
-    """Returns the cast concrete."""
+    """Makes the finish of cast concrete."""
     return Finish(Material(textures.concrete(color, seed), specular=0.08), (2.4, 2.4))
 
 
 @functools.cache
 def brick(seed: int, color: Color = (0.62, 0.33, 0.25)) -> Finish:
-    """Returns a brick wall."""
+    """Makes the finish of a brick wall."""
     return Finish(Material(textures.brick(seed, color)), (2.0, 1.85))
 
 
 @functools.cache
 def acoustic_ceiling(seed: int) -> Finish:
-    """Returns the mineral ceiling tiles of 0.6 m."""
+    """Makes the finish of mineral ceiling tiles of 0.6 m."""
     return Finish(Material(textures.acoustic(seed)), (2.4, 2.4))
 
 
@@ -75,7 +75,7 @@ def wood(color: Color, seed: int = 0, gloss: Real = 0.15) -> Finish:
 
 @functools.cache
 def plank_floor(color: Color, seed: int, gloss: Real = 0.2, rows: int = 14) -> Finish:
-    """Returns a floor of boards; glossy ones mirror a little."""
+    """Makes the finish of a floor of boards; glossy ones mirror a little."""
     material = Material(
         textures.planks(color, seed, rows), specular=gloss, shininess=40.0, mirror=0.18 * gloss
     )
@@ -130,7 +130,7 @@ def metal(color: Color = (0.68, 0.69, 0.7), seed: int = 0, mirror: Real = 0.15) 
 
 @functools.cache
 def enamel(color: Color, seed: int = 0, gloss: Real = 0.4) -> Finish:
-    """Returns the lacquer, ceramic, plastic."""
+    """Makes the finish of lacquer, ceramic or plastic."""
     texture = textures.enamel(color, seed)
     return Finish(
         Material(texture, specular=gloss, shininess=60.0, mirror=0.06 * gloss), (0.9, 0.9)
@@ -139,7 +139,7 @@ def enamel(color: Color, seed: int = 0, gloss: Real = 0.4) -> Finish:
 
 @functools.cache
 def fabric(color: Color, seed: int = 0) -> Finish:
-    """Returns the plain woven cloth."""
+    """Makes the finish of plain woven cloth."""
     return Finish(Material(patterns.fabric(color, seed)), (0.7, 0.7))
 
 
@@ -151,7 +151,7 @@ def striped(colors: tuple[Color, ...], seed: int = 0, repeats: int = 4) -> Finis
 
 @functools.cache
 def plaid(ground: Color, first: Color, second: Color, seed: int = 0) -> Finish:
-    """Returns the tartan cloth."""
+    """Makes the finish of tartan cloth."""
     return Finish(Material(patterns.plaid(ground, first, second, seed)), (0.8, 0.8))
 
 
@@ -163,7 +163,7 @@ def printed(ground: Color, inks: tuple[Color, ...], motif: str, seed: int) -> Fi
 
 @functools.cache
 def leather(color: Color, seed: int = 0) -> Finish:
-    """Returns the upholstery leather."""
+    """Makes the finish of upholstery leather."""
     return Finish(Material(patterns.leather(color, seed), specular=0.3, shininess=20.0), (0.8, 0.8))
 
 
@@ -175,32 +175,32 @@ def carpet(color: Color, fleck: Color, seed: int = 0) -> Finish:
 
 @functools.cache
 def rug(palette: tuple[Color, ...], seed: int) -> Finish:
-    """Returns a knotted rug, fitted once."""
+    """Makes the finish of a knotted rug, fitted once."""
     return Finish(Material(patterns.rug(palette, seed)))
 
 
 @functools.cache
 def leaf(color: Color, seed: int = 0) -> Finish:
-    """Returns a leaf, fitted once."""
+    """Makes the finish of a leaf, fitted once."""
     return Finish(Material(patterns.leaf(color, seed), specular=0.15, shininess=16.0))
 
 
 @functools.cache
 def glow(color: Color, seed: int = 0, emission: Real = 0.95) -> Finish:
-    """Returns a lamp shade or diffuser that shines by itself."""
+    """Makes the finish of a lamp shade or diffuser that shines by itself."""
     return Finish(Material(patterns.fabric(color, seed, 64), emission=emission), (0.5, 0.5))
 
 
 @functools.cache
 def mirror() -> Finish:
-    """Returns a silvered mirror with faint clouding."""
+    """Makes the finish of a silvered mirror with faint clouding."""
     texture = textures.enamel((0.8, 0.83, 0.84), 77)
     return Finish(Material(texture, specular=0.3, shininess=120.0, mirror=0.85), (0.9, 0.9))
 
 
 @functools.cache
 def window(seed: int) -> Finish:
-    """Returns a pane with what is seen through it. Depth sensors see nothing there."""
+    """Makes the finish of a pane with the view through it. Depth sensors see nothing there."""
     material = Material(
         artwork.window_view(seed), emission=0.9, mirror=0.06, specular=0.3, is_hole=True
     )
@@ -209,7 +209,7 @@ def window(seed: int) -> Finish:
 
 @functools.cache
 def glass(color: Color = (0.62, 0.74, 0.72), seed: int = 5) -> Finish:
-    """Returns the clear glass of a partition: streaks, half a reflection, and no depth."""
+    """Makes the finish of clear glass of a partition: streaks, half a reflection, and no depth."""
     texture = textures.metal(color, seed)
     return Finish(
         Material(texture, specular=0.6, shininess=120.0, mirror=0.45, is_hole=True), (1.6, 1.6)
@@ -230,7 +230,7 @@ def _flat(texture: np.ndarray, gloss: Real = 0.15, emission: Real = 0.0) -> Fini
 
 @functools.cache
 def picture(kind: str, seed: int, wide: bool = False) -> Finish:
-    """Returns a picture under glass: "landscape", "sunset", "abstract" or "poster"."""
+    """Makes the finish of a picture under glass: "landscape", "sunset", "abstract" or "poster"."""
     size = (384, 512) if wide else (512, 384)
     makers = {
         "landscape": lambda: artwork.landscape(seed, *size),
@@ -245,7 +245,7 @@ def picture(kind: str, seed: int, wide: bool = False) -> Finish:
 
 @functools.cache
 def screen(seed: int) -> Finish:
-    """Returns a computer screen that is on."""
+    """Makes the finish of a computer screen that is on."""
     material = Material(
         artwork.desktop(seed), emission=0.85, specular=0.3, shininess=80.0, mirror=0.05
     )
@@ -254,32 +254,32 @@ def screen(seed: int) -> Finish:
 
 @functools.cache
 def board(kind: str, seed: int) -> Finish:
-    """Returns a "white" or "black" writing board, written on."""
+    """Makes the finish of a "white" or "black" writing board, written on."""
     texture = artwork.whiteboard(seed) if kind == "white" else artwork.blackboard(seed)
     return _flat(texture, gloss=0.5 if kind == "white" else 0.1)
 
 
 @functools.cache
 def spines(seed: int) -> Finish:
-    """Returns the atlas of book spines."""
+    """Makes the finish of the atlas of book spines."""
     return _flat(artwork.book_spines(seed), gloss=0.12)
 
 
 @functools.cache
 def package(seed: int) -> Finish:
-    """Returns the print on a carton, tin or jar."""
+    """Makes the finish of the print on a carton, tin or jar."""
     return _flat(artwork.package(seed), gloss=0.25)
 
 
 @functools.cache
 def clock_face(seed: int) -> Finish:
-    """Returns a clock's dial."""
+    """Makes the finish of a clock's dial."""
     return _flat(artwork.clock(seed))
 
 
 @functools.cache
 def keyboard() -> Finish:
-    """Returns a keyboard's keys."""
+    """Makes the finish of a keyboard's keys."""
     return _flat(artwork.keyboard())
 
 

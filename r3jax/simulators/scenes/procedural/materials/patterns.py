@@ -30,7 +30,7 @@ def _bytes(color: Color, shade: Real = 1.0) -> Ink:
 
 
 def _weave(size: int, seed: int, threads: int) -> np.ndarray:
-    """Returns brightness of a plain weave, [size, size], about 1."""
+    """Computes the brightness of a plain weave, [size, size], about 1."""
     row, column = np.mgrid[0:size, 0:size].astype(np.float32) * (np.pi * threads / size)
     over = np.sin(row) * np.sin(column) > 0
     yarn = np.where(over, np.abs(np.sin(row)), np.abs(np.sin(column)))
@@ -40,13 +40,13 @@ def _weave(size: int, seed: int, threads: int) -> np.ndarray:
 
 @functools.cache
 def fabric(color: Color, seed: int, threads: int = 96, size: int = 512) -> np.ndarray:
-    """Returns the woven upholstery in one color, with melange and wear."""
+    """Paints woven upholstery in one color, with melange and wear."""
     return texels(_rgb(color) * _weave(size, seed, threads)[..., None])
 
 
 @functools.cache
 def stripes(colors: tuple[Color, ...], seed: int, repeats: int = 4, size: int = 512) -> np.ndarray:
-    """Returns the woven stripes of uneven width along the columns."""
+    """Paints woven stripes of uneven width along the columns."""
     rng = np.random.default_rng(seed)
     widths = rng.random(2 * len(colors)) + 0.25
     edges = np.cumsum(widths) / widths.sum()
@@ -58,7 +58,7 @@ def stripes(colors: tuple[Color, ...], seed: int, repeats: int = 4, size: int = 
 
 @functools.cache
 def plaid(ground: Color, first: Color, second: Color, seed: int, size: int = 512) -> np.ndarray:
-    """Returns a tartan blanket: bands of two colors cross on a ground."""
+    """Paints a tartan blanket: bands of two colors cross on a ground."""
     place = np.arange(size) / size * 4.0 % 1.0
     wide = smoothstep(0.1, 0.12, place) * (1.0 - smoothstep(0.4, 0.42, place))
     thin = smoothstep(0.68, 0.69, place) * (1.0 - smoothstep(0.75, 0.76, place))
@@ -82,7 +82,7 @@ def carpet(color: Color, fleck: Color, seed: int, size: int = 768) -> np.ndarray
 
 @functools.cache
 def rug(palette: tuple[Color, ...], seed: int, height: int = 512, width: int = 768) -> np.ndarray:
-    """Returns a knotted rug: a mirrored field, a medallion, a border and fringes."""
+    """Paints a knotted rug: a mirrored field, a medallion, a border and fringes."""
     row, column = np.mgrid[0:height, 0:width].astype(np.float32)
     y, x = np.abs(row / height * 2 - 1), np.abs(column / width * 2 - 1)
     aspect = width / height
@@ -232,7 +232,7 @@ def leather(color: Color, seed: int, size: int = 512) -> np.ndarray:
 
 @functools.cache
 def leaf(color: Color, seed: int, size: int = 256) -> np.ndarray:
-    """Returns a leaf blade: midrib along the rows' middle, side veins, mottling. Fits one leaf."""
+    """Paints a leaf blade: midrib along the rows' middle, side veins, mottling. Fits one leaf."""
     row, column = np.mgrid[0:size, 0:size].astype(np.float32) / size
     side = np.abs(row - 0.5)
     midrib = 1.0 - smoothstep(0.01, 0.04, side)

@@ -19,7 +19,7 @@ Real = float | int
 
 @functools.lru_cache(maxsize=8)
 def _spectrum(height: int, width: int, seed: int) -> np.ndarray:
-    """Returns the fourier transform of white noise, [h, w // 2 + 1].
+    """Draws the Fourier transform of white noise, [h, w // 2 + 1].
 
     Many fields are shaped from one.
     """
@@ -50,7 +50,7 @@ def cloud(
     stretch_x: Real = 1.0,
     lowest: Real = 1.0,
 ) -> np.ndarray:
-    """Returns a periodic random field with the amplitude spectrum 1 / f ** slope.
+    """Makes a periodic random field with the amplitude spectrum 1 / f ** slope.
 
     Fields are drawn from a small pool and shifted by the seed: a Fourier transform per field
     would make a scene take seconds, and a shifted field under another color looks new.
@@ -74,7 +74,7 @@ def cloud(
 
 
 def ridge(num: int, seed: int, slope: Real = 1.5) -> np.ndarray:
-    """Returns a periodic one-dimensional skyline, [num] float32, mean 0, standard deviation 1."""
+    """Makes a periodic one-dimensional skyline, [num] float32, mean 0, standard deviation 1."""
     rng = np.random.default_rng(seed)
     spectrum = np.fft.rfft(rng.standard_normal(num))
     frequency = np.arange(len(spectrum))
@@ -84,7 +84,7 @@ def ridge(num: int, seed: int, slope: Real = 1.5) -> np.ndarray:
 
 
 def smoothstep(low: Real, high: Real, x: np.ndarray) -> np.ndarray:
-    """Returns 0 below `low`, 1 above `high`, a smooth ramp between."""
+    """Computes a smooth ramp: 0 below `low`, 1 above `high`."""
     t = np.clip((x - low) / (high - low), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
@@ -127,7 +127,7 @@ def plaster(color: Color, seed: int, strength: Real = 1.0, size: int = 768) -> n
 
 @functools.cache
 def concrete(color: Color, seed: int, size: int = 768) -> np.ndarray:
-    """Returns the cast concrete: clouds, pits, the seams and tie holes of its formwork."""
+    """Paints cast concrete: clouds, pits, the seams and tie holes of its formwork."""
     broad, fine = cloud(size, size, seed, 1.5), cloud(size, size, seed + 1, 0.4, 1.0, 30.0)
     pits = smoothstep(2.1, 2.6, cloud(size, size, seed + 2, 0.9, 1.0, 24.0))
     row, column = np.mgrid[0:size, 0:size] / size
@@ -138,7 +138,7 @@ def concrete(color: Color, seed: int, size: int = 768) -> np.ndarray:
 
 
 def _grain(color: Color, seed: int, height: int, width: int, rings: Real) -> np.ndarray:
-    """Returns the wood cut along the grain, [h, w, 3] float32."""
+    """Paints wood cut along the grain, [h, w, 3] float32."""
     warp = cloud(height, width, seed, 2.1, 7.0)
     fibre = cloud(height, width, seed + 1, 0.7, 24.0, 6.0)
     row = np.arange(height, dtype=np.float32)[:, None] / height
@@ -153,7 +153,7 @@ def _grain(color: Color, seed: int, height: int, width: int, rings: Real) -> np.
 
 @functools.cache
 def wood(color: Color, seed: int, rings: Real = 11.0, size: int = 512) -> np.ndarray:
-    """Returns the furniture wood, grain along the rows."""
+    """Paints furniture wood, grain along the rows."""
     return texels(_grain(color, seed, size, size, rings))
 
 
@@ -161,7 +161,7 @@ def wood(color: Color, seed: int, rings: Real = 11.0, size: int = 512) -> np.nda
 def planks(
     color: Color, seed: int, rows: int = 14, contrast: Real = 0.16, size: int = 768
 ) -> np.ndarray:
-    """Returns a floor of staggered planks, each cut from another place of the wood."""
+    """Paints a floor of staggered planks, each cut from another place of the wood."""
     rng = np.random.default_rng(seed)
     base = _grain(color, seed, size, size, 17.0)
     image = np.empty_like(base)
@@ -241,7 +241,7 @@ def tiles(
 
 @functools.cache
 def brick(seed: int, color: Color = (0.62, 0.33, 0.25), size: int = 768) -> np.ndarray:
-    """Returns a brick wall in running bond with rough mortar."""
+    """Paints a brick wall in running bond with rough mortar."""
     tone = (0.72, 0.55, 0.45)
     colors = tuple(
         tuple(float(c * k + 0.12 * t * (k < 0.9)) for c, t in zip(color, tone, strict=True))
@@ -266,7 +266,7 @@ def marble(color: Color, vein: Color, seed: int, size: int = 768) -> np.ndarray:
 
 @functools.cache
 def terrazzo(color: Color, chips: tuple[Color, ...], seed: int, size: int = 768) -> np.ndarray:
-    """Returns the terrazzo: angular chips of several sizes in cement."""
+    """Paints terrazzo: angular chips of several sizes in cement."""
     rng = np.random.default_rng(seed)
     image = Image.new("RGB", (size, size), tuple(int(255 * c) for c in color))
     draw = ImageDraw.Draw(image)
@@ -293,7 +293,7 @@ def metal(color: Color, seed: int, size: int = 384) -> np.ndarray:
 
 @functools.cache
 def enamel(color: Color, seed: int, size: int = 384) -> np.ndarray:
-    """Returns the lacquer, ceramic, plastic: nearly even, with wear, dust and scratches."""
+    """Paints lacquer, ceramic or plastic: nearly even, with wear, dust and scratches."""
     broad, fine = cloud(size, size, seed, 1.7), cloud(size, size, seed + 1, 0.5, 1.0, 20.0)
     scratch = smoothstep(2.2, 3.2, cloud(size, size, seed + 2, 0.8, 12.0, 10.0))
     shade = 1.0 + 0.05 * broad + 0.035 * fine - 0.12 * scratch
