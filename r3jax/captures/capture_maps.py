@@ -118,9 +118,7 @@ def map_surfaces(
             grid = integrate_rays(grid, np.asarray(frame.position), _measured_points(frame))
         on_frame()
     # The camera itself was there, whatever the sensor says of places so near.
-    for position in survey.alignment.points(source.poses[survey.chosen, :3, 3]):
-        grid = _free_ball(grid, jnp.asarray(position, dtype=jnp.float32))
-    return state, grid
+    return state, free_round(grid, survey.alignment.points(source.poses[survey.chosen, :3, 3]))
 
 
 _MOST_RAYS = 1000
@@ -184,6 +182,13 @@ def _measured_points(frame: Frame) -> np.ndarray:
     y = (row + 0.5 - float(camera.cy)) / float(camera.fy)
     T = np.asarray(frame.T_world_camera, np.float64)
     return (z * np.stack([x, y, np.ones_like(x)])).T @ T[:3, :3].T + T[:3, 3]
+
+
+def free_round(grid: OccupancyGrid, cameras: np.ndarray) -> OccupancyGrid:
+    """Marks the space round the cameras [n, 3] as free, a margin wide [audit units]."""
+    for position in cameras:
+        grid = _free_ball(grid, jnp.asarray(position, dtype=jnp.float32))
+    return grid
 
 
 @jax.jit

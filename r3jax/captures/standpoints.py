@@ -31,6 +31,9 @@ _MOST_LATTICE = 40_000
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
 
 
+_FEWEST = 24
+"""With fewer places in free space, those where the camera was are taken, too."""
+
 _OVER = 4
 """At most one place in this many is only reached with an arm."""
 
@@ -77,7 +80,7 @@ def places_of(
         meter: a meter [audit units]; None: the capture's unit is not known.
 
     Returns:
-        Places in known free space; where there is none, places of the cameras.
+        Places in known free space; where there are few, those of the cameras, too.
     """
     voxels = np.asarray(state.center, np.float64).T[np.asarray(state.occupied)]
     if is_dense:
@@ -85,8 +88,8 @@ def places_of(
     else:
         found = places_in_hull(cameras, voxels)
         found = found[is_free_at(grid, found)]
-    if not len(found):
-        found = cameras
+    if len(found) < _FEWEST:
+        found = np.concatenate([found, cameras])
     ground = ground_of(grid, voxels, cameras, meter) if is_dense else None
     footing = None if ground is None else ground.footing(found)
     if footing is None or footing.is_over.all():

@@ -29,6 +29,7 @@ from matplotlib import colormaps
 from r3jax.apps.audit.diagnosis import CAUSES, demand_of, diagnose, score_from_standpoints
 from r3jax.apps.audit.directions import steps_between
 from r3jax.apps.audit.sentences import GOOD, SHORT, listed
+from r3jax.captures.capture_maps import free_round
 from r3jax.captures.standpoints import places_of
 from r3jax.captures.survey import RANGE
 from r3jax.frame import Frame
@@ -227,8 +228,8 @@ class _Handler(BaseHTTPRequestHandler):
         """Says nothing on the console."""
 
 
-_PLACES = 8
-"""Places to stand from which surfaces are scored; an audit takes three times as many."""
+_PLACES = 12
+"""Places to stand from which surfaces are scored; an audit takes twice as many."""
 
 _HEADROOM = 0.35
 """As in `floor_picture` [m]."""
@@ -288,7 +289,9 @@ def scan_progress(planner: Planner, camera: Camera, places: np.ndarray) -> ScanP
     """
     state = planner.map_state
     config = ScoringConfig(max_range=RANGE)
-    stand = places_of(state, planner.grid, places, _PLACES, is_dense=True, meter=1.0).standing
+    # As an audit does it: the camera was there, whatever the sensor says of places so near.
+    grid = free_round(planner.grid, places)
+    stand = places_of(state, grid, places, _PLACES, is_dense=True, meter=1.0).standing
     demand = demand_of(state, stand, config)
     found = diagnose(state, demand, score_from_standpoints(state, demand, camera.focal, config))
     value = np.where(found.is_seen, found.value, np.nan)
