@@ -13,7 +13,7 @@ _BLANKS = "\n\u00a0"
 
 
 def check_viser() -> None:
-    """Refuses to go on without viser, which shows pages.
+    """Checks that viser, which shows pages, is installed.
 
     Raises:
         InputError: it is not installed; the message says how to get it.
@@ -25,13 +25,13 @@ def check_viser() -> None:
 
 
 def resume_command(command: str, path: Path) -> str:
-    """Returns what goes on with a run, to be copied into a shell."""
+    """Returns the command that resumes a run, to be copied into a shell."""
     return f"r3jax {command} --resume {shlex.quote(str(path))}"
 
 
 @contextlib.contextmanager
 def resumable(command: str, path: Path) -> Generator[None]:
-    """Lets Ctrl-C tell how to go on with what is on disk, at whatever moment it comes.
+    """Names, where Ctrl-C interrupts, the command that resumes from the files on disk.
 
     Raises:
         KeyboardInterrupt: as it came, with a message.
@@ -39,7 +39,7 @@ def resumable(command: str, path: Path) -> Generator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"go on with `{resume_command(command, path)}`") from None
+        raise KeyboardInterrupt(f"resume with `{resume_command(command, path)}`") from None
 
 
 def one_line(error: BaseException) -> str:

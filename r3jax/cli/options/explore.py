@@ -46,7 +46,7 @@ Loop = FieldsOf(
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """Explore a small embedded flat, train splats on the frames, judge them; takes minutes.
+    """Explore a small embedded flat, train splats on the frames, evaluate them; takes minutes.
 
     For example
         r3jax demo
@@ -95,7 +95,7 @@ class ContinueOptions:
         """Refuses both at once, and a fork from nowhere."""
         if self.resume is not None and self.fork is not None:
             raise InputError(
-                "--resume goes on with a run, --fork begins another one: give one of them"
+                "--resume continues a run, --fork begins another one: give one of them"
             )
         if (self.at is None) != (self.fork is None):
             raise InputError("--fork RUN and --at FRAME belong together")

@@ -188,7 +188,7 @@ def check_folder(path: Path) -> None:
 
 
 def check_model(path: Path, name: str, resolution: int | None) -> None:
-    """Refuses what no model can be trained on or judged by, and what none can be called.
+    """Refuses a path, a name or a size that no training and no evaluation takes.
 
     Raises:
         ValueError: names the option or the path.

@@ -1,4 +1,4 @@
-"""The options of the commands that train and judge splats."""
+"""The options of the commands that train splats and evaluate them."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -136,5 +136,5 @@ class EvaluateOptions:
     )
 
     def __post_init__(self) -> None:
-        """Refuses what no model can be judged by, and what none can be called."""
+        """Refuses a path, a name or a size that no evaluation takes."""
         check_model(self.path, self.name, self.resolution)

@@ -126,7 +126,7 @@ class ExportOptions:
     format: Literal["nerfstudio", "colmap", "colmap-text", "submission"] = "nerfstudio"
     """`nerfstudio`: images, depth, points.ply, transforms.json. `colmap`: the same with
     sparse/0/*.bin in place of transforms.json; `colmap-text`: with *.txt. `submission`: one file of
-    poses, some kB, that `r3jax benchmark --submission` judges."""
+    poses, some kB, for `r3jax benchmark --submission`."""
 
     def __post_init__(self) -> None:
         """Refuses what is no run, and to write over anything."""
