@@ -273,9 +273,9 @@ def _evaluated_frames(
     step: Callable[[], None],
     on_progress: Progress,
 ) -> Iterator[EvaluatedFrame]:
-    """Yields the frames of the path.
+    """Yields the evaluated frames of the path.
 
-    The capture's own are evaluated without the fold that they are in.
+    The capture's own frames are evaluated without the fold that they are in.
     """
     known = None if source.is_complete else known_rows(seen.state, is_complete=False)
     if path is not None:
@@ -315,9 +315,9 @@ def _blank_regions(
 def _open_grid(
     source: Source, survey: Survey, seen: Seen, cameras: np.ndarray, config: ScoringConfig
 ) -> OccupancyGrid:
-    """Returns the grid in which only edges are unexplored.
+    """Returns the grid in which only the edges of the seen space are unexplored.
 
-    Where free space ends in what could be seen.
+    An edge is where free space ends although it could have been seen.
     """
     grid = seen.grid
     if not source.is_dense:

@@ -43,9 +43,9 @@ _EMPTY = 0.93
 
 
 def frames_figure(audit: Audit) -> Figure:
-    """Returns the renderability of every frame along the path, colored by what costs most.
+    """Draws the renderability of every frame along the path, and its histogram.
 
-    Its histogram.
+    The colors show what costs each frame most.
     """
     figure = style.new_figure(10.0, 3.2)
     left, right = figure.subplots(1, 2, width_ratios=[2.6, 1.0], sharey=True)
@@ -97,7 +97,7 @@ def gain_figure(audit: Audit) -> Figure:
 
 
 def panorama_strip(audit: Audit, count: int = 3) -> Figure:
-    """Returns all directions from some standpoints: colors above, renderability below."""
+    """Draws all directions from some standpoints: colors above, renderability below."""
     standpoints = audit.standpoints[:count]
     figure = style.new_figure(10.0, 2.55 * len(standpoints))
     grid = figure.subplots(len(standpoints), 2, squeeze=False)
@@ -274,9 +274,10 @@ class _Shown:
 
 
 def best_picture(audit: Audit, region: Region) -> _Shown | None:
-    """Returns the image with the region near its middle, at a good distance, and not hidden.
+    """Finds the image with the region near its middle, at a good distance, and not hidden.
 
-    Only depth images tell what is hidden. None: no image has the region's middle in it.
+    Only depth images can show that a region is hidden. Returns None if no image has the region's
+    middle in it.
     """
     poses = audit.survey.alignment.poses(audit.source.poses[audit.survey.chosen])
     found: list[tuple[float, float, _Shown]] = []
@@ -297,7 +298,7 @@ def best_picture(audit: Audit, region: Region) -> _Shown | None:
 
 
 def _shows(audit: Audit, finding: _Shown, z: float) -> bool:
-    """Returns False where something else is measured there."""
+    """Returns False if the depth image measures something else there."""
     if not audit.source.is_dense:
         return True
     depth = audit.source.read(finding.index)[1][int(finding.row), int(finding.column)]
@@ -305,7 +306,7 @@ def _shows(audit: Audit, finding: _Shown, z: float) -> bool:
 
 
 def region_figure(audit: Audit) -> Figure | None:
-    """Returns the worst regions in images of the capture; None where no image shows any."""
+    """Draws the worst regions in images of the capture; returns None if no image shows any."""
     shown = [
         (number, region, finding)
         for number, region in enumerate(audit.regions)

@@ -119,9 +119,10 @@ def _cards(audit: Audit) -> dict[str, str]:
 
 
 def picture_faults(audit: Audit) -> dict[str, Any]:
-    """Returns what is wrong with single pictures.
+    """Returns findings, remarks and notes about single pictures.
 
-    Findings, remarks where there are none, and notes.
+    A remark takes the place of findings where there are none, or says that the poses contradict
+    each other.
     """
     faults = audit.faults
     findings = [_finding(audit, finding) for finding in faults.findings]
@@ -147,7 +148,10 @@ def picture_faults(audit: Audit) -> dict[str, Any]:
 
 
 def _nothing_found(audit: Audit) -> str:
-    """Returns what was looked for and not found; of the rest nothing is said."""
+    """Describes the faults that were looked for and not found.
+
+    Only what could be measured is mentioned.
+    """
     record = audit.faults.record
     known = lambda name: any(value is not None for value in record.get(name, []))
     good = [
@@ -178,14 +182,14 @@ def _finding(audit: Audit, finding: Finding) -> dict[str, Any]:
 
 
 def _thumbnail(audit: Audit, index: int) -> bytes:
-    """Returns a small PNG of an image of the capture, its upper edge up."""
+    """Returns a small PNG of an image of the capture, with the vertical pointing up."""
     rgb, _ = audit.source.read(index)
     up = audit.survey.alignment.rotation.T @ [0.0, 0.0, 1.0]
     return small_png(rgb, audit.source.poses[index], up, _SIDE)
 
 
 def _causes(audit: Audit) -> list[dict[str, Any]]:
-    """Returns a row for each cause."""
+    """Returns a table row for each cause."""
     found, is_complete = audit.diagnosis, audit.source.is_complete
     whole = float(found.is_seen.sum()) * audit.survey.voxel_size**2
     rows: list[dict[str, Any]] = []
@@ -214,7 +218,7 @@ def _causes(audit: Audit) -> list[dict[str, Any]]:
 
 
 def _regions(audit: Audit) -> list[dict[str, Any]]:
-    """Returns a row for each bad region, and for each place where the capture ends."""
+    """Returns a table row for each bad region, and for each place where the capture ends."""
     rows: list[dict[str, Any]] = []
     for number, region in enumerate(audit.all_regions):
         center = audit.survey.alignment.points_back(region.center[None])[0]
@@ -240,10 +244,7 @@ def _shows(view: Suggestion, region: Region) -> bool:
 
 
 def _views(audit: Audit) -> list[dict[str, Any]]:
-    """Returns every suggested view.
-
-    The way to it, why it is suggested, where it is, what it shows.
-    """
+    """Describes every suggested view: the path to it, the reason, its pose, and what it shows."""
     described: list[dict[str, Any]] = []
     regions = audit.all_regions
     for view, pose in zip(audit.plan.views, suggested_poses(audit), strict=True):

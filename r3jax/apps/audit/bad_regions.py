@@ -63,7 +63,7 @@ class Region:
 
 
 def bad_regions(state: MapState, diagnosis: Diagnosis, most: int = MOST) -> list[Region]:
-    """Returns where surfaces that are known would render badly; the largest loss first.
+    """Finds the known surfaces that would render badly, the largest loss first.
 
     The loss of a block is the sum of 1 - R over its bad voxels. A region is what lies within half
     a block of the bad voxel in the middle of the worst block that is left.
@@ -121,7 +121,7 @@ def unseen_edges(grid: OccupancyGrid, open_cells: np.ndarray) -> np.ndarray:
 
 
 def unseen_regions(grid: OccupancyGrid, edges: np.ndarray, most: int = MOST_UNSEEN) -> list[Region]:
-    """Returns where a capture ends: blocks of unseen cells beside free space, the largest first.
+    """Finds the ends of a capture: blocks of unseen cells beside free space, the largest first.
 
     Args:
         grid: free and occupied space.
@@ -145,10 +145,10 @@ def unseen_regions(grid: OccupancyGrid, edges: np.ndarray, most: int = MOST_UNSE
 def blank_points(
     state: MapState, known: np.ndarray, camera: Camera, pose: np.ndarray, config: ScoringConfig
 ) -> np.ndarray:
-    """Returns where the pixels of an image without a known surface look, [k, 3] [audit units].
+    """Estimates the points that pixels without a known surface look at, [k, 3] [audit units].
 
     Their depth is that of the nearest pixel with a known surface: a guess, good for a wall between
-    its edges. An image without any says nothing.
+    its edges. An image without any known surface gives no points.
 
     Args:
         state: the map of all images.
@@ -178,7 +178,7 @@ def blank_points(
 def blank_regions(
     state: MapState, points: Sequence[np.ndarray], most: int = MOST_UNSEEN
 ) -> list[Region]:
-    """Returns places that images show and of which no surface is known, the largest first.
+    """Finds places that images show but where no surface is known, the largest first.
 
     Args:
         state: the map of all images; of it, the voxels' size.

@@ -73,7 +73,7 @@ FEWEST_PICTURES = 2
 
 
 def known_rows(state: MapState, is_complete: bool) -> np.ndarray:
-    """Returns which rows of the map of all images are known surfaces, [N].
+    """Returns a mask of the rows of the map of all images that are known surfaces, [N].
 
     Args:
         state: the map.
@@ -216,14 +216,14 @@ class Diagnosis:
         return float((self.value[evaluated] >= FINE).mean()) if evaluated.any() else 0.0
 
     def share(self, cause: str) -> float:
-        """Returns the share of the surfaces that can be seen, of those with this cause."""
+        """Returns the share of this cause among the surfaces that can be seen, in [0, 1]."""
         evaluated = self.is_seen
         wanted = self.cause[evaluated] == CAUSES.index(cause)
         return float(wanted.mean()) if evaluated.any() else 0.0
 
 
 def demand_of(state: MapState, standpoints: np.ndarray, config: ScoringConfig) -> Demand:
-    """Returns which voxels each standpoint sees.
+    """Computes which voxels each standpoint sees.
 
     Args:
         state: the map.
@@ -247,7 +247,7 @@ def _visible(
 def score_from_standpoints(
     state: MapState, demand: Demand, focal: Float[Array, ""], config: ScoringConfig
 ) -> StandpointScores:
-    """Returns every standpoint's answers.
+    """Scores the voxels of the map from every standpoint.
 
     Args:
         state: the map; its surfaces are those of the demand.
@@ -270,7 +270,7 @@ def _answers(
     config: ScoringConfig,
     ids: Float[Array, " q"],
 ) -> tuple[Float[Array, "q N"], Float[Array, "q 3 N"], Float[Array, "q 3 N"]]:
-    """Returns values, terms and costs of some of the standpoints."""
+    """Computes values, terms and costs for some of the standpoints."""
     num = voxels.count.shape[0]
 
     def answer(number: Float[Array, ""]) -> tuple[Array, Array, Array]:
@@ -322,11 +322,9 @@ def diagnose(state: MapState, demand: Demand, answers: StandpointScores) -> Diag
 
 
 def cause_of(value: np.ndarray, costs: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Returns the index into `CAUSES` of each voxel, [N].
+    """Returns the index into `CAUSES` of each voxel, [N]: its costliest term, or `fine`.
 
-    The dearest term, where the product is not fine.
-
-    A low bias of a voxel that hardly any image has measured is called rare; of others, angle.
+    A voxel with a low bias is called `rare` if hardly any image has measured it, else `angle`.
 
     Args:
         value: mean renderability, [N].

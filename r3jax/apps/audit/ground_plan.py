@@ -34,13 +34,13 @@ HIDDEN = "#9ca3af"
 
 
 def score_colors(value: np.ndarray) -> np.ndarray:
-    """Returns RGB [n, 3] uint8 of renderabilities [n] in [0, 1]: red, yellow, green."""
+    """Colors renderabilities [n] in [0, 1] from red over yellow to green, RGB [n, 3] uint8."""
     rgba = colormaps[style.SCORE_MAP](np.clip(value, 0.0, 1.0))
     return np.rint(255.0 * np.asarray(rgba)[..., :3]).astype(np.uint8)
 
 
 def cause_colors(diagnosis: Diagnosis) -> np.ndarray:
-    """Returns RGB [N, 3] uint8 of every voxel's cause."""
+    """Returns the color of every voxel's cause, RGB [N, 3] uint8."""
     table = np.array([_rgb(COLOR_OF_CAUSE[name]) for name in CAUSES], np.uint8)
     return np.where(
         diagnosis.is_seen[:, None], table[diagnosis.cause], np.array(_rgb(HIDDEN), np.uint8)
@@ -145,13 +145,13 @@ def _map(audit: Audit, height: float) -> tuple[Figure, Axes, np.ndarray]:
 
 
 def ground_label(audit: Audit, axis: int) -> str:
-    """Returns the name of a horizontal axis of the map, in the capture's words where it has any."""
+    """Names a horizontal axis of the map, by the capture's own axis where they are parallel."""
     name = axis_name(audit.survey.alignment, axis)
     return f"{name or ('along the ground', 'across')[axis]} [{audit.survey.unit}]"
 
 
 def axis_name(alignment: Alignment, axis: int) -> str | None:
-    """Returns the capture's axis that an axis of the audit is, such as `-z`; None: none of them."""
+    """Returns the capture's axis along an axis of the audit, such as `-z`; None if there is none."""
     direction = alignment.rotation[axis]
     best = int(np.argmax(np.abs(direction)))
     if abs(direction[best]) < 0.9999 or np.any(alignment.origin != 0.0):
@@ -160,9 +160,9 @@ def axis_name(alignment: Alignment, axis: int) -> str | None:
 
 
 def _used(audit: Audit, height: float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the rectangle that holds nearly all surfaces, and all cameras.
+    """Returns two corners of the rectangle around nearly all surfaces and all cameras.
 
-    [2] each [audit units].
+    Each corner is [2] [audit units].
     """
     centers = _below(audit, height)[0][:, :2]
     marks = [np.stack([frame.pose[:2, 3] for frame in audit.frames])]

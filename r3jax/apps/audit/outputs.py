@@ -65,7 +65,7 @@ def write_outputs(audit: Audit, folder: Path, capture: Path) -> dict[str, Path]:
 
 
 def audited_capture(folder: Path) -> Path | None:
-    """Returns the capture whose audit a folder holds; None: not known."""
+    """Returns the path of the capture that a folder holds the audit of, or None if not known."""
     try:
         record = parse_json(read_bytes(folder / "audit.json", _MAX_BYTES))
         return Path(record["capture_path"])
@@ -184,7 +184,7 @@ def record_of(audit: Audit) -> dict[str, Any]:
 
 
 def _surfaces(audit: Audit, face: float) -> dict[str, Any]:
-    """Returns shares by cause, as on the page, and areas of what is known.
+    """Returns shares by cause, as on the page, and areas of the known surfaces.
 
     Args:
         audit: what was found.
@@ -204,7 +204,7 @@ def _surfaces(audit: Audit, face: float) -> dict[str, Any]:
 
 
 def _score(score: ViewScore) -> dict[str, Any]:
-    """Returns the numbers of a frame; null where nothing that it shows is known."""
+    """Returns the scores of a frame; the renderability is null if it shows no known surface."""
     known = None if np.isnan(score.renderability) else score.renderability
     return {**dataclasses.asdict(score), "renderability": known}
 

@@ -76,17 +76,17 @@ _ORDINARY = ("angle", "rare", "distance", "noise")
 
 
 def length(audit: Audit, in_audit: float) -> str:
-    """Returns a length of the audit, in the capture's units."""
+    """Writes a length of the audit in the capture's units."""
     return f"{audit.survey.length(in_audit):.3g} {audit.survey.unit}"
 
 
 def area(audit: Audit, in_audit: float) -> str:
-    """Returns an area of the audit to two digits, in the capture's units: voxels count no finer."""
+    """Writes an area of the audit in the capture's units, with two digits: voxels are no finer."""
     return f"{two_digits(in_audit * audit.survey.length(1.0) ** 2)} {audit.survey.unit}²"
 
 
 def two_digits(value: float) -> str:
-    """Returns a positive number with two digits that count: 0.012, 2.0, 76, 1200."""
+    """Writes a positive number with two significant digits: 0.012, 2.0, 76, 1200."""
     rounded = float(f"{value:.2g}")
     return f"{rounded:.0f}" if rounded >= 10.0 else f"{rounded:#.2g}"
 
@@ -97,7 +97,7 @@ def point(position: np.ndarray) -> str:
 
 
 def origin(audit: Audit) -> str | None:
-    """Returns the point that was subtracted from a capture far from its origin; None: none."""
+    """Names the point that was subtracted from a capture far from its origin, if any was."""
     subtracted = audit.survey.alignment.origin
     if not np.any(subtracted):
         return None
@@ -108,7 +108,7 @@ def origin(audit: Audit) -> str | None:
 
 
 def verdict(audit: Audit) -> list[str]:
-    """Returns what the audit comes to, a sentence each."""
+    """Summarizes the audit, one sentence each."""
     sentences = [_surfaces(audit)]
     first = int(audit.survey.is_one_place)  # nothing goes before that
     if (audit.survey.up.within or 0.0) > _DOUBTFUL:
@@ -131,9 +131,9 @@ def verdict(audit: Audit) -> list[str]:
 
 
 def _surfaces(audit: Audit) -> str:
-    """Returns how much of what was seen renders well.
+    """Says how much of the seen surface renders well.
 
-    Of pictures from one place that is not known.
+    For pictures from one place, that is not known.
     """
     survey = audit.survey
     if survey.is_one_place:
@@ -157,7 +157,7 @@ def _surfaces(audit: Audit) -> str:
 
 
 def _promises(audit: Audit) -> list[str]:
-    """Returns how the frames would render, and what further views would add."""
+    """Says how the frames would render, and what further views would add."""
     found, plan = audit.diagnosis, audit.plan
     sentences: list[str] = []
     mean = audit.mean_renderability
@@ -190,7 +190,7 @@ def _promises(audit: Audit) -> list[str]:
 
 
 def vertical(audit: Audit) -> str:
-    """Returns which way is up, and how sure that is."""
+    """Says which direction is up, and how certain that is."""
     up = audit.survey.up
     if up.within is None:
         return f"Up is {_up_name(up.direction)} of the capture."
@@ -204,7 +204,7 @@ def vertical(audit: Audit) -> str:
 
 
 def unread(audit: Audit) -> list[str]:
-    """Returns which pictures could not be read, and why: one sentence, or none."""
+    """Says which pictures could not be read, and why: one sentence, or none."""
     left_out = audit.faults.left_out
     if not left_out:
         return []
@@ -217,7 +217,7 @@ def unread(audit: Audit) -> list[str]:
 
 
 def without_depth(audit: Audit) -> list[str]:
-    """Returns how many pictures say nothing of depth: one sentence, or none."""
+    """Says how many pictures have no depth: one sentence, or none."""
     count = len(audit.faults.without_depth)
     if not count:
         return []
@@ -229,16 +229,16 @@ def without_depth(audit: Audit) -> list[str]:
 
 
 def cause_share(audit: Audit, cause: str) -> float:
-    """Returns the share of what is evaluated that has this cause, or `fine`.
+    """Returns the share of the evaluated surface with this cause, or `fine`.
 
-    With a depth camera: of the surface visible from where people could stand. Without: of what the
-    frames show, as points exist only where pictures saw them.
+    With a depth camera that is the surface visible from where people could stand; without one, the
+    surface that the frames show, as points exist only where pictures saw them.
     """
     return audit.diagnosis.share(cause) if audit.source.is_complete else audit.shares[cause]
 
 
 def saturation() -> str:
-    """Returns what R cannot say of a capture that is covered well."""
+    """Explains what R cannot measure in a capture that is covered well."""
     return (
         f"With a mean of {SATURATED:g} or more, R says that these pictures show what others show "
         "well enough, and not which of them renders better: of a kitchen of 250 pictures with a "
@@ -253,7 +253,7 @@ def listed(parts: list[str]) -> str:
 
 
 def reason(audit: Audit, view: Suggestion, letters: Iterable[str]) -> str:
-    """Returns why a view is suggested."""
+    """Explains why a view is suggested."""
     face = audit.survey.voxel_size**2
     parts: list[str] = []
     total = sum(view.causes.values())
@@ -279,7 +279,7 @@ def reason(audit: Audit, view: Suggestion, letters: Iterable[str]) -> str:
 
 
 def method(audit: Audit) -> list[str]:
-    """Returns how the numbers came about, a sentence or two each."""
+    """Explains how the numbers were computed, in a sentence or two each."""
     survey, source = audit.survey, audit.source
     depth = {
         "depth": "depth images",

@@ -74,7 +74,7 @@ def view_gains(
     poses: np.ndarray,
     config: ScoringConfig,
 ) -> np.ndarray:
-    """Returns the gain of every view, [C] [voxels].
+    """Computes the gain of every view, [C] [voxels].
 
     Args:
         state: the map.
@@ -93,7 +93,7 @@ def view_gains(
 def view_coverage(
     state: MapState, camera: Camera, poses: np.ndarray, config: ScoringConfig
 ) -> np.ndarray:
-    """Returns the share of the pixels of every view that show a voxel, [C].
+    """Computes the share of the pixels of every view that show a voxel, [C].
 
     Arguments as in `view_gains`.
     """
@@ -245,7 +245,7 @@ class Task:
     """Settings of all scores."""
 
     def evaluate(self, state: MapState) -> tuple[StandpointScores, Diagnosis]:
-        """Returns what the standpoints say of a map, and what it comes to."""
+        """Scores a map from the standpoints, and diagnoses the scores."""
         answers = score_from_standpoints(state, self.demand, self.camera.focal, self.config)
         return answers, diagnose(state, self.demand, answers)
 
@@ -291,7 +291,7 @@ class LazyGreedy:
         *,
         key: Array,
     ) -> tuple[Decision | None, Memory, PlanInfo]:
-        """Returns the candidate with the largest gain; None where none gains a voxel."""
+        """Chooses the candidate with the largest gain, or None if none gains a voxel."""
         del key  # nothing is drawn
         gains, num = state.gains.copy(), len(self.poses)
         answers, diagnosis = self.task.evaluate(map_state)
@@ -390,7 +390,10 @@ _NO_POSES = np.zeros((0, 4, 4))
 def candidate_poses(
     state: MapState, grid: OccupancyGrid, task: Task, places: np.ndarray
 ) -> np.ndarray:
-    """Returns the best directions of every place, [C, 4, 4] float64: exactly rigid, roll-free."""
+    """Finds the best directions at every place, as poses [C, 4, 4] float64.
+
+    They are exactly rigid and without roll.
+    """
     panoramas = score_positions(state, grid, task.camera, places, task.config)
     scores = np.asarray(panoramas.direction_scores)
     lattice = fibonacci_lattice(scores.shape[1])
@@ -404,7 +407,7 @@ def candidate_poses(
 
 
 def _apart(scores: np.ndarray, lattice: np.ndarray) -> np.ndarray:
-    """Returns indices of the best directions of a place, apart from each other."""
+    """Returns indices of the best directions at a place, at least `_APART` degrees apart."""
     left = scores.astype(np.float64)
     chosen: list[int] = []
     for _ in range(DIRECTIONS):
@@ -422,9 +425,9 @@ def _best(
     answers: StandpointScores,
     poses: np.ndarray,
 ) -> int | None:
-    """Returns the candidate that gains most now; brings `gains` up to date as far as needed.
+    """Finds the candidate with the largest gain now, updating `gains` as far as needed.
 
-    None: no candidate gains anything worth it.
+    Returns None if no candidate gains enough.
     """
     is_new = np.zeros(len(gains), dtype=bool)
     while len(gains):
@@ -455,7 +458,7 @@ class _Taken(NamedTuple):
 
 
 def _imagine(planner: Planner, task: Task, decision: Decision) -> tuple[Planner, _Taken]:
-    """Returns the planner as if a view had been taken, and what that view shows."""
+    """Simulates taking a view: returns the planner after it, and what the view shows."""
     T = jnp.asarray(decision.T_world_camera, dtype=jnp.float32)
     cells = visible_unexplored(planner.map_state, planner.grid, task.camera, T, task.config)
     after, shown = simulate_view(planner.map_state, task.camera, T, task.config)

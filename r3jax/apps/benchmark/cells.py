@@ -110,7 +110,7 @@ class Conditions(ExplorationTerms, TrainingTerms):
         return Camera.from_fov(self.resolution, self.resolution, self.fov)
 
     def exploration_config(self) -> ExplorationConfig:
-        """Returns settings of the loop."""
+        """Returns the settings of the exploration loop."""
         return ExplorationConfig(
             voxel_size=self.voxel_size,
             cell_size=self.cell_size,
@@ -122,7 +122,7 @@ class Conditions(ExplorationTerms, TrainingTerms):
         )
 
     def train_config(self, seed: int) -> TrainConfig:
-        """Returns settings of the training: vanilla 3DGS, the same for every policy."""
+        """Returns the settings of the training: vanilla 3DGS, the same for every policy."""
         return TrainConfig(
             iterations=self.iterations,
             num_gaussians=self.gaussians,
@@ -133,7 +133,7 @@ class Conditions(ExplorationTerms, TrainingTerms):
         )
 
     def policy(self, name: str, settings: dict[str, Any]) -> Policy:
-        """Returns a policy that scores what this sensor sees.
+        """Makes a policy that scores what this sensor sees.
 
         Args:
             name: one of `planning.registry.policy_names()`.
@@ -181,7 +181,7 @@ def _further(given: dict[str, Any], config: type, own: tuple[str, ...]) -> dict[
 
 
 def snapshot_slug(snapshot: str) -> str:
-    """Returns a snapshot as a part of file names: `views:30` is `views-30`."""
+    """Returns a snapshot as a part of file names: `views:30` becomes `views-30`."""
     return str(parse_budget(snapshot)).replace(":", "-")
 
 
@@ -332,20 +332,20 @@ class CellPaths:
         return self.folder / "error.txt"
 
     def record(self, snapshot: str) -> Path:
-        """Returns the result of one snapshot: it is done if this file is there."""
+        """Returns the path of a snapshot's result; the snapshot is done if this file exists."""
         return self.folder / f"snapshot-{snapshot_slug(snapshot)}.json"
 
     def checkpoints(self, snapshot: str) -> Path:
-        """Returns the folder of a training that is under way."""
+        """Returns the folder of a training in progress."""
         return self.folder / "training" / snapshot_slug(snapshot)
 
     def model(self, snapshot: str) -> Path:
-        """Returns the trained Gaussians."""
+        """Returns the path of the trained Gaussians."""
         return self.run / "models" / snapshot_slug(snapshot) / "scene.ply"
 
 
 def paths_of(root: Path, cell: Cell) -> CellPaths:
-    """Returns where the files of a cell lie in a benchmark's folder."""
+    """Returns the paths of a cell's files in a benchmark's folder."""
     return CellPaths(Path(root) / "cells" / cell.name)
 
 

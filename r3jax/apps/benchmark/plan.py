@@ -58,7 +58,7 @@ class Request:
 def make_plan(
     request: Request, root: Path, on_stage: Callable[[str], None] = lambda stage: None
 ) -> tuple[Cell, ...]:
-    """Returns every cell, scene by scene, with each scene's test views rendered and stored.
+    """Makes every cell, scene by scene; renders and stores each scene's test views.
 
     Args:
         request: what to do.
@@ -109,7 +109,7 @@ def cells_left(root: Path, cells: Sequence[Cell]) -> tuple[Cell, ...]:
 def prepare_scene(
     request: Request, scene: str, root: Path, on_stage: Callable[[str], None]
 ) -> ViewSet:
-    """Returns a scene's test set; its images lie in the folder afterwards.
+    """Computes a scene's test set, and renders and stores its images unless they are there.
 
     Args:
         request: how scenes are opened, and on what terms.

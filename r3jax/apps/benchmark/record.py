@@ -58,7 +58,7 @@ def make_record(
     outcome: str,
     rows: Sequence[ViewRow],
 ) -> dict[str, Any]:
-    """Returns what is kept of a snapshot.
+    """Makes the record of a snapshot.
 
     Args:
         root: folder of the benchmark.
@@ -119,7 +119,7 @@ def make_record(
 
 
 def _metrics(rows: Sequence[ViewRow]) -> dict[str, Any]:
-    """Returns every summary by the metric's name; None where no view has a value."""
+    """Summarizes every metric, by name; None where no view has a value."""
     metrics: dict[str, Any] = {metric.name: None for metric in METRICS}
     for summary in summarize(rows):
         plain = dataclasses.asdict(summary)
@@ -129,7 +129,7 @@ def _metrics(rows: Sequence[ViewRow]) -> dict[str, Any]:
 
 
 def _columns(rows: Sequence[ViewRow]) -> dict[str, Any]:
-    """Returns rows as columns; None instead of a column that has no value at all."""
+    """Turns rows into columns; a column without any value becomes None."""
     columns: dict[str, Any] = {}
     for field in dataclasses.fields(ViewRow):
         values = [_finite(getattr(row, field.name)) for row in rows]
@@ -152,7 +152,7 @@ def write_record(path: Path, record: dict[str, Any]) -> None:
 
 
 def read_records(root: Path, cells: Iterable[Cell] | None = None) -> list[dict[str, Any]]:
-    """Returns the records that are there, in a fixed order: by the folder's name, then by snapshot.
+    """Reads the records that are there, ordered by the folder's name, then by snapshot.
 
     Args:
         root: folder of the benchmark.
@@ -174,7 +174,7 @@ def read_records(root: Path, cells: Iterable[Cell] | None = None) -> list[dict[s
 
 
 def _read_record(path: Path) -> dict[str, Any]:
-    """Returns one record.
+    """Reads one record.
 
     Raises:
         ValueError: it is damaged, or a newer version of this package wrote it.
@@ -191,7 +191,7 @@ def _read_record(path: Path) -> dict[str, Any]:
 
 
 def _parse_record(text: bytes) -> dict[str, Any]:
-    """Returns a record from its line.
+    """Parses a record from its line.
 
     Raises:
         VersionError: a newer version of this package wrote it.
@@ -251,7 +251,7 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
 
 @functools.cache
 def machine() -> str:
-    """Returns the kind of machine; never its name, which is private."""
+    """Describes the kind of machine, never its name, which is private."""
     import jax
 
     devices = jax.devices()
@@ -263,7 +263,7 @@ def machine() -> str:
 
 @functools.cache
 def source_commit() -> str | None:
-    """Returns the commit of this package's source, `-dirty` if it was changed; None: not known."""
+    """Returns the commit of this package's source, with `-dirty` if changed; None if not known."""
     package = Path(__file__).resolve().parents[2]
 
     def git(*words: str) -> str:

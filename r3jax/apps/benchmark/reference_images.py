@@ -46,7 +46,7 @@ class ReferenceImages:
 
 
 def reference_path(root: Path, scene_hash: str, set_hash: str, conditions: Conditions) -> Path:
-    """Returns where the images lie; another file for everything that changes them."""
+    """Returns the path of the images; everything that changes them changes the path."""
     sizes = conditions.resolution, conditions.fov, conditions.train_resolution
     return path_of_images(root, scene_hash, set_hash, sizes)
 
@@ -82,7 +82,7 @@ def save_reference_images(path: Path, reference: ReferenceImages) -> None:
 
 
 def read_reference_images(path: Path) -> ReferenceImages:
-    """Returns the inverse of `save_reference_images`.
+    """Reads the images that `save_reference_images` wrote.
 
     Raises:
         FileNotFoundError: the images are not there.
@@ -142,7 +142,7 @@ def _check(stored: dict[str, np.ndarray]) -> None:
 
 
 def load_reference_images(root: Path, cell: Cell) -> ReferenceImages:
-    """Returns the test views of a cell, as they were rendered when the benchmark was planned.
+    """Reads the test views of a cell, as they were rendered when the benchmark was planned.
 
     Raises:
         FileNotFoundError: they are not there.

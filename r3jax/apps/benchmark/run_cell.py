@@ -133,7 +133,7 @@ def _lock(folder: Path) -> Generator[None]:
 
 
 def _finished_run(path: Path) -> Run | None:
-    """Returns the exploration, if there is one that came to its end."""
+    """Reads the exploration if it is there and came to its end, else returns None."""
     try:
         run = read_run(path)
     except RunError:
@@ -202,7 +202,7 @@ def _open(cell: Cell) -> Simulator:
 
 
 def _header(cell: Cell, simulator: Simulator, policy: dict[str, Any]) -> RunHeader:
-    """Returns the header of the exploration of a cell by a policy."""
+    """Makes the header of the exploration of a cell by a policy."""
     conditions = cell.conditions
     return RunHeader(
         scene={
@@ -245,7 +245,7 @@ def _retake(
 
 
 def _begin_or_resume(path: Path, header: RunHeader) -> tuple[RunWriter, Run | None]:
-    """Returns a new run, or what was recorded of the one that lies there."""
+    """Creates a new run, or opens the existing one and reads its recorded views."""
     if (path / "run.json").exists():
         try:
             return RunWriter.resume(path)
@@ -317,7 +317,7 @@ def _do_snapshot(
 
 
 def _submission_fields(submission: Submission, run: Run) -> dict[str, Any]:
-    """Returns what a record tells of the submission that it judges."""
+    """Returns a record's fields about the submission that it judges."""
     pairs = zip(submission.frames, run.rows, strict=True)
     return {
         "sha256": content_hash(submission),

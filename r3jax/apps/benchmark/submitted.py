@@ -167,7 +167,7 @@ def check_submission(submission: Submission, simulator: Simulator) -> list[Probl
 
 
 def _check_start(submission: Submission, simulator: Simulator) -> Iterator[Problem]:
-    """Yields the first frame is taken at the scene's start, at no cost."""
+    """Yields a problem if the first frame is not taken at the scene's start, at no cost."""
     first, start = submission.frames[0], begin_at(submission.robot, simulator.start_pose)
     apart = float(np.linalg.norm(first.position - start[:3, 3]))
     turned = math.degrees(angle_between(first.pose.astype(np.float64), start))
@@ -180,11 +180,11 @@ def _check_start(submission: Submission, simulator: Simulator) -> Iterator[Probl
 
 
 def check_captures(submission: Submission, lengths: Sequence[float]) -> Iterator[Problem]:
-    """Yields the before a view there are no more frames captured while moving than the loop takes.
+    """Yields problems of paths with more frames captured while moving than the loop would take.
 
     The loop cuts a path into the fewest equal pieces that are not too long, and captures a frame
     between two of them: for n frames the whole path is longer than n of the longest pieces, and
-    the way up to the last of them longer than n / (n + 1) of that.
+    the part up to the last of them longer than n / (n + 1) of that.
     """
     config, frames = submission.config, submission.frames
     longest = config.piece_at(submission.robot.speed or config.speed)
@@ -212,7 +212,7 @@ def check_times(
     flown: float,
     length: float,
 ) -> Iterator[str]:
-    """Yields the clock leaves time for deciding, flying and mapping."""
+    """Yields a problem where the clock leaves too little time to decide, to fly and to map."""
     config, motion = submission.config, submission.robot
     costs = model_clock(config).costs if config.clock == "model" else {}
     if frame.mapping < _less(costs.get("mapping", 0.0)):
@@ -241,7 +241,7 @@ def check_times(
 
 
 def _less(value: float) -> float:
-    """Returns a length [m] or a time [s] with what rounding may take from it."""
+    """Returns a length [m] or a time [s] less a tolerance for rounding."""
     return value * (1.0 - 1e-4) - 1e-4
 
 
@@ -302,7 +302,7 @@ def plan_submission(
     max_test_views: int | None = 120,
     on_stage: Callable[[str], None] = lambda stage: None,
 ) -> Cell:
-    """Returns the cell of a submission, with its scene's test views rendered and stored.
+    """Plans the cell of a submission; renders and stores its scene's test views.
 
     Args:
         submission: as it was read.
@@ -345,7 +345,7 @@ def plan_submission(
 
 
 def _settings_of(submission: Submission) -> dict[str, Any]:
-    """Returns what tables must tell of how the views were chosen: what carried the camera."""
+    """Returns the settings that tables must show: the robot, unless it flies freely."""
     if submission.robot == MOTIONS["free"]:
         return {}
     names = [name for name, motion in MOTIONS.items() if motion == submission.robot]
@@ -353,7 +353,7 @@ def _settings_of(submission: Submission) -> dict[str, Any]:
 
 
 def stored_submission(root: Path, digest: str) -> Path:
-    """Returns where a benchmark keeps a submission, by the hash of its content."""
+    """Returns the path of a submission in a benchmark's folder, by the hash of its content."""
     return Path(root) / FOLDER / f"{digest[:16]}.jsonl"
 
 
@@ -441,9 +441,9 @@ def retake(
 
 
 def _choices(frames: Sequence[SubmittedFrame], paths: Sequence[np.ndarray]) -> list[Choice | None]:
-    """Returns the path to each view, all that is known of its choice.
+    """Returns a choice for the first frame of the path to each view, else None.
 
-    As in a trace, it belongs to the first frame that was taken on the path.
+    Only the path of the choice is known. As in a trace, it belongs to the first frame on the path.
     """
     choices: list[Choice | None] = [None] * len(frames)
     first = 1

@@ -87,7 +87,7 @@ class Table:
 
 
 def metric_named(name: str) -> Metric:
-    """Returns the metric of `scores.METRICS`.
+    """Looks up a metric of `scores.METRICS` by name.
 
     Raises:
         ValueError: there is none of that name.
@@ -100,16 +100,15 @@ def metric_named(name: str) -> Metric:
 
 
 def full_title(metric: Metric) -> str:
-    """Returns the metric's title where it does not stand below that of PSNR."""
+    """Returns the metric's title for use on its own, where no title of PSNR stands above it."""
     return "PSNR [dB], holes left out" if metric.name == "psnr_measured" else metric.title
 
 
 def ranked(values: Sequence[float | None], metric: Metric) -> list[Entry]:
-    """Returns entries of one column.
+    """Ranks the entries of one column.
 
-    All that *read* the same as the best are best, second likewise.
-
-    With one value there is nothing to compare, so nothing is marked.
+    All that *read* the same as the best are best, second likewise. With one value there is nothing
+    to compare, so nothing is marked.
     """
     texts = [MISSING.text if v is None else f"{v:.{metric.decimals}f}" for v in values]
     sign = 1.0 if metric.lower_is_better else -1.0
@@ -122,25 +121,25 @@ def ranked(values: Sequence[float | None], metric: Metric) -> list[Entry]:
 
 
 def with_bounds(entry: Entry, found: Estimate, metric: Metric, sign: str = "") -> Entry:
-    """Returns the entry with its 95 % interval; `sign` as in format strings."""
+    """Adds the 95 % interval to an entry; `sign` as in format strings."""
     low, high = (f"{end:{sign}.{metric.decimals}f}" for end in (found.low, found.high))
     extra = {"low": found.low, "high": found.high}
     return Entry(entry.value, f"{entry.text} [{low}, {high}]", entry.rank, extra)
 
 
 def with_name(entry: Entry, name: str) -> Entry:
-    """Returns the entry with what it belongs to."""
+    """Adds to an entry the name that it belongs to."""
     return Entry(entry.value, f"{entry.text} ({name})", entry.rank, {"name": name})
 
 
 def seed_text(seeds: Sequence[Sequence[int]]) -> str:
-    """Returns the fewest and most seeds of some cells: `3`, `2-3`."""
+    """Writes the fewest and most seeds of some cells: `3`, `2-3`."""
     counts = sorted({len(found) for found in seeds})
     return f"{counts[0]}" if len(counts) == 1 else f"{counts[0]}-{counts[-1]}"
 
 
 def seed_texts(cells: Sequence[Cell]) -> dict[str, str]:
-    """Returns the same for each method over all scenes of the table."""
+    """Writes the fewest and most seeds of each method over all scenes of the table."""
     found = seeds_by_method(cells)
     return {method: seed_text(list(scenes.values())) for method, scenes in found.items()}
 
@@ -176,7 +175,7 @@ def notes(cells: Sequence[Cell]) -> tuple[str, ...]:
 
 
 def _short_commit(commit: str | None) -> str:
-    """Returns the ten digits, and whether the source was changed after it."""
+    """Shortens a commit to ten digits, and keeps the mark of a changed source."""
     digits, hyphen, changed = (commit or "unknown").partition("-")
     return f"{digits[:10]}{hyphen}{changed}"
 
@@ -186,7 +185,7 @@ PAPER_METRICS = ("ssim", "psnr", "lpips")
 
 
 def quality_table(cells: Sequence[Cell], title: str = "", *, with_intervals: bool = False) -> Table:
-    """Returns the paper's table: methods x (SSIM, PSNR, LPIPS) by scenes and their mean.
+    """Makes the paper's table: methods x (SSIM, PSNR, LPIPS) by scenes and their mean.
 
     A field is the mean over seeds of the mean over the scene's test views. The last column is the
     mean of the scenes, and missing for a method without one of them: means over other scenes are
@@ -229,7 +228,7 @@ def quality_table(cells: Sequence[Cell], title: str = "", *, with_intervals: boo
 
 
 def _part(scores: Scores, scene: str | None, scenes: Sequence[str]) -> Scores:
-    """Returns the scores of one scene, or (None) of all if there are some for all; empty if not."""
+    """Selects the scores of one scene, or (None) of all if no scene is missing; empty otherwise."""
     if scene is not None:
         return {scene: scores[scene]} if scene in scores else {}
     return scores if set(scores) == set(scenes) else {}
@@ -257,9 +256,9 @@ def headed_groups(records: Sequence[Cell]) -> list[tuple[str, list[Cell]]]:
 
 
 def groups_on_equal_terms(records: Sequence[Cell]) -> list[list[Cell]]:
-    """Returns records of one snapshot in groups that may share a table, each as large as it can be.
+    """Groups records of one snapshot that may share a table, each group as large as possible.
 
-    One that is there twice (the same method, scene and seed) begins a group of its own.
+    A second record of the same method, scene and seed begins a group of its own.
     """
     groups: list[list[Cell]] = []
     for record in records:

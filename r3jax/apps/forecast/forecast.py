@@ -51,7 +51,7 @@ _FACES = ndimage.generate_binary_structure(3, 1)
 
 
 def possible_cells(grid: OccupancyGrid, margin: float = MARGIN) -> np.ndarray:
-    """Returns cells that a camera may stand in, for all that is known, [X, Y, Z] bool.
+    """Returns a mask of the cells that a camera may stand in, [X, Y, Z] bool.
 
     None of them comes nearer than `margin` [m] to an occupied cell or to the end of the grid, and
     each connects over others of them to one that is known to be free.
@@ -64,7 +64,7 @@ def possible_cells(grid: OccupancyGrid, margin: float = MARGIN) -> np.ndarray:
 
 
 def free_space_views(grid: OccupancyGrid, num: int) -> np.ndarray:
-    """Returns the first `num` views of a fixed sequence over the grid that stand in possible cells.
+    """Selects the first `num` views of a fixed sequence over the grid that stand in possible cells.
 
     Args:
         grid: what is known.
@@ -87,7 +87,7 @@ def free_space_views(grid: OccupancyGrid, num: int) -> np.ndarray:
 def _sequence() -> np.ndarray:
     """Returns positions and directions in the unit cube, evenly spread, [n, 4].
 
-    The same for every run.
+    They are the same for every run.
     """
     return qmc.Sobol(d=4, scramble=False).random(_NUM_DRAWN)
 
@@ -110,10 +110,7 @@ class Forecast:
     calibration: Calibration
 
     def value(self, name: str) -> float:
-        """Returns the forecast of a statistic, `mean` or `p10` [dB].
-
-        -inf where there is no view.
-        """
+        """Returns the forecast of a statistic, `mean` or `p10` [dB]; -inf if there is no view."""
         return statistic(self.mixture, name) if self.mixture.size else -np.inf
 
     def interval(self, name: str, level: float = 0.8) -> tuple[float, float]:
@@ -157,7 +154,7 @@ def forecast_map(
 def view_features(
     state: MapState, camera: Camera, poses: Float[Array, "V 4 4"], config: ScoringConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the coverage and renderability of views, [V] float64 each."""
+    """Computes the coverage and renderability of views, [V] float64 each."""
     coverage, renderability = _features(state, camera, poses, config)
     return np.asarray(coverage, dtype=np.float64), np.asarray(renderability, dtype=np.float64)
 
@@ -256,7 +253,7 @@ class Outlook:
         return [int(counts[frames - 1]) for frames in self.frames]
 
     def _views_by_frame(self) -> np.ndarray:
-        """Returns views up to each frame of the run, that frame included."""
+        """Counts the views up to each frame of the run, that frame included."""
         return np.cumsum([not row.captured for row in self.run.rows])
 
     def watch(

@@ -76,9 +76,9 @@ class PsnrModel:
 
 
 def fit(coverage: np.ndarray, renderability: np.ndarray, psnr: np.ndarray) -> PsnrModel:
-    """Returns the model of views whose PSNR is known.
+    """Fits the model to views of known PSNR by weighted least squares.
 
-    Weighted least squares, location and scale in turn.
+    Location and scale are fitted in turn.
 
     Args:
         coverage: of each view, [V] in [0, 1].
@@ -105,14 +105,14 @@ def fit(coverage: np.ndarray, renderability: np.ndarray, psnr: np.ndarray) -> Ps
 
 
 def statistic(values: np.ndarray, name: str) -> float:
-    """Returns the mean or a percentile of values, by its name: `mean`, `p10`."""
+    """Computes the mean or a percentile of values, by its name: `mean`, `p10`."""
     return (
         float(np.mean(values)) if name == MEAN else float(np.percentile(values, percent_of(name)))
     )
 
 
 def percent_of(name: str) -> float:
-    """Returns the number in the name of a percentile.
+    """Parses the number in the name of a percentile.
 
     Raises:
         ValueError: no percentile has that name.
@@ -139,9 +139,10 @@ class Calibration:
     """Which runs, in a sentence."""
 
     def half_width(self, name: str, level: float) -> float:
-        """Returns half of the interval of a statistic [dB]: that share of the errors is no larger.
+        """Returns half of a statistic's interval [dB]: the quantile `level` of its errors.
 
-        Between two percentiles whose errors are known it is interpolated; outside, the last one's.
+        For other percentiles it is interpolated between those whose errors are known; beyond the
+        last of these it is constant.
         """
         if name in self.errors:
             return float(np.quantile(self.errors[name], level))
@@ -156,7 +157,7 @@ def leave_one_out(
     scenes: Sequence[str],
     models: Sequence[str],
 ) -> list[dict[str, tuple[float, float]]]:
-    """Returns the forecast and truth of every model, by a calibration that has not seen its scene.
+    """Forecasts every model by a calibration without its scene; returns forecasts and truth.
 
     Args:
         coverage: of each view, [V].
@@ -186,7 +187,7 @@ def leave_one_out(
 
 
 def errors_of(pairs: Sequence[Mapping[str, tuple[float, float]]]) -> dict[str, tuple[float, ...]]:
-    """Returns sizes of the errors by statistic, increasing, as `Calibration` keeps them."""
+    """Returns the absolute errors by statistic, increasing, as `Calibration` stores them."""
     return {
         name: tuple(sorted(round(abs(pair[name][0] - pair[name][1]), 4) for pair in pairs))
         for name in STATISTICS
@@ -216,7 +217,7 @@ _KINDS = {
 
 @functools.cache
 def default_calibration() -> Calibration:
-    """Returns the calibration that comes with the package."""
+    """Reads the calibration that comes with the package."""
     return read_calibration(Path(str(files("r3jax.apps.forecast") / "calibration.json")))
 
 
@@ -232,7 +233,7 @@ def write_calibration(path: Path, calibration: Calibration) -> None:
 
 
 def read_calibration(path: Path) -> Calibration:
-    """Returns a calibration that `write_calibration` wrote.
+    """Reads a calibration that `write_calibration` wrote.
 
     Raises:
         ValueError: the file is no calibration, or one of another version.
@@ -287,7 +288,7 @@ class Goal:
     """`mean`, or a percentile: `p10`."""
 
     def reached(self, forecast: PsnrForecast) -> bool:
-        """Returns True if the forecast is at least as good."""
+        """Returns True if the forecast reaches the goal."""
         return forecast.value(self.statistic) >= self.psnr
 
     def __str__(self) -> str:

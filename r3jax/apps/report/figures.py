@@ -122,7 +122,7 @@ _DOT, _CAPTURED_DOT = 26, 8
 
 
 def progress_figure(run: Run) -> Figure:
-    """Returns the coverage and mean renderability against views, or frames, and against seconds."""
+    """Draws coverage and mean renderability against views, or frames, and against seconds."""
     figure = style.new_figure(10.0, 5.6)
     axes = figure.subplots(2, 2, sharex="col", sharey="row")
     numbers = np.arange(1, len(run.rows) + 1)
@@ -159,7 +159,7 @@ def progress_figure(run: Run) -> Figure:
 
 
 def plan_figure(run: Run, map_state: MapState, grid: OccupancyGrid) -> Figure:
-    """Returns the place from above, with the path colored by acquisition order."""
+    """Draws the place from above, with the path colored by acquisition order."""
     positions = np.array([row.pose[:3, 3] for row in run.rows])
     picture, extent = floor_picture(map_state, grid, float(np.median(positions[:, 2])))
     width, height = extent[1] - extent[0], extent[3] - extent[2]
@@ -204,7 +204,7 @@ def _draw_path(axes: Axes, rows: Sequence[StepRow]) -> None:
 
 
 def _draw_views(axes: Axes, rows: Sequence[StepRow]) -> PathCollection:
-    """Returns draws where frames were taken, smaller while moving, and where the camera looked."""
+    """Draws where frames were taken, smaller while moving, and where the camera looked."""
     x, y, _ = np.array([row.pose[:3, 3] for row in rows]).T
     u, v, _ = np.array([row.pose[:3, 2] for row in rows]).T
     order, (low, high) = np.arange(len(rows)), _span(rows)
@@ -240,7 +240,7 @@ def _span(rows: Sequence[StepRow]) -> tuple[int, int]:
 
 
 def cost_figure(run: Run) -> Figure:
-    """Returns the step times by stage, and the memory of the map."""
+    """Draws the step times by stage, and the memory of the map."""
     figure = style.new_figure(10.0, 3.8)
     left, right = figure.subplots(1, 2, width_ratios=[1.4, 1.0])
     table = stage_times(run)
@@ -271,7 +271,7 @@ def cost_figure(run: Run) -> Figure:
 
 
 def strip_figure(run: Run, count: int = 12) -> Figure:
-    """Returns some of the recorded images, evenly spread over the run."""
+    """Draws some of the recorded images, evenly spread over the run."""
     from PIL import Image
 
     steps = np.unique(np.linspace(0, len(run.rows) - 1, count).round().astype(int))
@@ -334,7 +334,7 @@ _MANY = 60
 def utility_by_cause(
     run: Run, states: Iterable[tuple[MapState, OccupancyGrid]] | None = None
 ) -> np.ndarray:
-    """Returns what each view of a run promised when it was chosen, by cause.
+    """Computes the utility that each view of a run promised when it was chosen, by cause.
 
     Args:
         run: the run.
@@ -352,21 +352,19 @@ def utility_by_cause(
 
 
 def shares_of(utility: np.ndarray) -> np.ndarray:
-    """Returns shares of each view's utility, [views, 4].
+    """Divides each view's utility by its total, [views, 4].
 
-    0 where it promised nothing, NaN where unknown.
+    The shares are 0 where the view promised nothing, and NaN where that is not known.
     """
     total = utility.sum(axis=1, keepdims=True)
     return np.where(total == 0.0, 0.0, utility / np.where(total == 0.0, 1.0, total))
 
 
 def reasons_figure(utility: np.ndarray) -> Figure:
-    """Returns the utility of each chosen view by cause.
+    """Draws the utility of each chosen view by cause: shares above, amounts below.
 
-    Shares, and below how much on a logarithmic axis.
-
-    Where much is unexplored, that hides the other causes in the shares. Only chosen views count:
-    the start and the frames captured while moving are left out.
+    The amounts have a logarithmic axis, as unexplored space may hide the other causes in the
+    shares. Only chosen views count: the start and the frames captured while moving are left out.
 
     Args:
         utility: by view and cause, [views, 4]; NaN for views that no policy chose.

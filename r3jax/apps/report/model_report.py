@@ -70,7 +70,7 @@ class EvaluatedModel:
 
 
 def read_evaluated_model(run: Run) -> EvaluatedModel | None:
-    """Returns the newest evaluation of the run; None if there is none.
+    """Reads the newest evaluation of the run; returns None if there is none.
 
     Raises:
         RunError: the files are damaged.
@@ -110,7 +110,7 @@ def _check(evaluation: Any) -> None:
 
 
 def _read_columns(path: Path) -> dict[str, np.ndarray]:
-    """Returns history.csv by column; empty if it has no rows.
+    """Reads history.csv by column; returns an empty dict if it has no rows.
 
     Raises:
         ValueError, csv.Error: not a table, or not with these columns.
@@ -144,7 +144,7 @@ def _check_hash(path: Path, data: bytes, sha256: str | None) -> None:
 
 
 def training_figure(history: dict[str, np.ndarray]) -> Figure:
-    """Returns PSNR of the training views and number of Gaussians, against steps."""
+    """Draws the PSNR of the training views and the number of Gaussians against steps."""
     figure = style.new_figure(10.0, 2.9)
     left, right = figure.subplots(1, 2)
     step, psnr = history["step"], history["psnr"]
@@ -160,9 +160,9 @@ def training_figure(history: dict[str, np.ndarray]) -> Figure:
 
 
 def quality_rows(evaluation: dict[str, Any]) -> list[list[str]]:
-    """Returns the metrics as a table.
+    """Makes the table of metrics.
 
-    Name, mean, interval, median, tail, worst, share of poor ones.
+    A row holds the name, mean, interval, median, tail, worst view and share of poor views.
     """
     rows: list[list[str]] = []
     for name, metric in evaluation["metrics"].items():
@@ -182,7 +182,7 @@ def quality_rows(evaluation: dict[str, Any]) -> list[list[str]]:
 
 
 def quality_note(evaluation: dict[str, Any]) -> str:
-    """Returns how the numbers came about, in a sentence or two."""
+    """Explains how the numbers were computed, in a sentence or two."""
     trained_on = evaluation.get("trained_on")
     count = len(evaluation["numbers"])
     if trained_on == 0:

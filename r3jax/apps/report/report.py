@@ -135,16 +135,16 @@ def write_report(
 
 
 def _saved(path: Path, figure: Figure) -> bytes:
-    """Returns the figure as PNG, which is also written beside the page."""
+    """Writes the figure beside the page, and returns its PNG."""
     png = style.to_png(figure)
     write_atomic(path, png)
     return png
 
 
 def _reasons(run: Run, outlook: Outlook, on_progress: Progress) -> Figure | str:
-    """Returns what the views were chosen for, or why that is not known.
+    """Draws why the views were chosen, or says why that is not known.
 
-    The outlook sees the maps too.
+    The outlook receives the same maps.
     """
     on_progress("looking back at the views", len(run.rows) - 1)  # nothing was chosen after the last
     states = outlook.watch(_counted(states_of(run), on_progress))
@@ -168,7 +168,7 @@ def _forecast(outlook: Outlook, map_state: MapState, grid: OccupancyGrid) -> Fig
 
 
 def _model(folder: Path, model: EvaluatedModel) -> dict[str, Any]:
-    """Returns what the page says of the trained model; what came out of it all stands first."""
+    """Returns the page's fields about the trained model."""
     return {
         "note": quality_note(model.evaluation),
         "rows": quality_rows(model.evaluation),
@@ -178,7 +178,7 @@ def _model(folder: Path, model: EvaluatedModel) -> dict[str, Any]:
 
 
 def _cards(run: Run, model: EvaluatedModel | None) -> dict[str, str]:
-    """Returns a few large numbers: what came out of the run first."""
+    """Returns a few large numbers, results first."""
     last, captured = run.rows[-1], sum(row.captured for row in run.rows)
     views = str(len(run.rows) - captured)
     cards: dict[str, str] = {}
@@ -198,7 +198,7 @@ def _cards(run: Run, model: EvaluatedModel | None) -> dict[str, str]:
 
 
 def _settings(run: Run) -> dict[str, str]:
-    """Returns the outcome, numbers and every setting, so that the page explains itself."""
+    """Returns the outcome, the totals and every setting, so that the page explains itself."""
     header = run.header
     return {
         **summary(run),
@@ -212,7 +212,7 @@ def _settings(run: Run) -> dict[str, str]:
 
 
 def _in_words(settings: dict[str, Any]) -> str:
-    """Returns settings as text: `name value`, groups in brackets behind their name."""
+    """Writes settings as text: `name value`, groups in brackets after their name."""
     texts: list[str] = []
     for name, value in settings.items():
         words = name.replace("_", " ")

@@ -57,7 +57,7 @@ class StageTime:
 
 
 def stage_times(run: Run) -> list[StageTime]:
-    """Returns the step times by stage, as measured; stages that never ran are left out."""
+    """Computes the step times by stage, as measured; stages that never ran are left out."""
     table: list[StageTime] = []
     known = [*STAGES, *sorted({k for t in run.timings for k in t} - {"step", *STAGES})]
     for key in known:
@@ -86,7 +86,7 @@ def outcome(run: Run) -> str:
 
 
 def summary(run: Run) -> dict[str, str]:
-    """Returns what happened, as short texts under short names."""
+    """Summarizes a run in short texts under short names."""
     header = run.header
     texts = {
         "scene": str(header.scene.get("name", "?")),
@@ -114,9 +114,9 @@ def summary(run: Run) -> dict[str, str]:
 
 
 def map_row_bytes(run: Run) -> int:
-    """Returns bytes of one row of the map.
+    """Returns the bytes of one row of the map.
 
-    Two words of key, the bins, count, color, m2, resolution.
+    A row has two words of key, the bins, count, color, m2 and resolution.
     """
     num_words = -(-int(run.header.config.get("num_bins", 64)) // 32)
     return 4 * (2 + num_words + 1 + 3 + 1 + 1)

@@ -148,7 +148,7 @@ def _only_writer(folder: Path, stack: contextlib.ExitStack) -> None:
 def _with_starts(
     scenes: Sequence[SceneSettings], cell_size: float
 ) -> tuple[list[SceneSettings], list[Simulator]]:
-    """Returns the scene as each camera sees it; all but the first start beside the first.
+    """Opens the scene for each camera; all but the first camera start beside the first.
 
     Raises:
         ValueError: there is no room.

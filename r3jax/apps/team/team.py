@@ -224,7 +224,7 @@ class Common:
 
 
 def last_meeting(seconds: float, meet_every: float) -> float:
-    """Returns the clock at the last meeting [s]; 0 for `meet_every`: the radio is always on."""
+    """Returns the clock at the last meeting [s]; 0 for `meet_every` means always in contact."""
     return math.floor(seconds / meet_every) * meet_every if meet_every > 0.0 else seconds
 
 
@@ -236,7 +236,7 @@ def in_order(observations: tuple[Observation, ...]) -> list[Observation]:
 def share(
     common: Common, until: float, config: ExplorationConfig, *, repeat_compiled: bool
 ) -> tuple[Common, list[SharedFrame]]:
-    """Returns a meeting: all frames up to a time join the common map.
+    """Holds a meeting: all frames up to a time join the common map.
 
     Args:
         common: before.
@@ -371,7 +371,7 @@ def _start(
     on_stage: Callable[[str], None] | None,
     recorded: Run | None,
 ) -> tuple[Mission, LoopState]:
-    """Returns one member's mission, and its state before the first view."""
+    """Prepares one member: its mission, and its state before the first view."""
     key = jax.random.key(seed)
     # The first member is the camera that `explore` would fly alone.
     init_key, key = jax.random.split(jax.random.fold_in(key, number) if number else key)
@@ -425,9 +425,9 @@ def _fly(
 
 
 def _meet(flying: list[_Flying], common: Common, until: float, views: list[TeamView]) -> Common:
-    """Returns all frames up to a time become common; every member receives them.
+    """Adds all frames up to a time to the common map, and sends them to every member.
 
-    Adds to `views`.
+    Their views are appended to `views`.
     """
     mission = flying[0].mission
     common, shared = share(common, until, mission.config, repeat_compiled=mission.clock.measures)
@@ -439,7 +439,7 @@ def _meet(flying: list[_Flying], common: Common, until: float, views: list[TeamV
 
 
 def _take_over(me: _Flying, common: Common) -> _Flying:
-    """Returns the common map becomes one's own, with the frames on top that were not shared yet."""
+    """Replaces a member's map by the common one, with its own unshared frames on top."""
     received = me.received
     if all(shared.view.member == me.number for shared in received):
         return replace(me, received=())  # one's own map is just that already
@@ -470,7 +470,7 @@ def _take_over(me: _Flying, common: Common) -> _Flying:
 
 
 def _with_common(state: LoopState, common: Common) -> LoopState:
-    """Returns the state with the map and the grid of all."""
+    """Returns the state with the common map and grid."""
     planner = replace(state.planner, map_state=common.map_state, grid=common.grid)
     return replace(state, planner=planner)
 
@@ -487,9 +487,9 @@ def _promised_to(me: _Flying, common: Common) -> tuple[PromisedView, ...]:
 
 
 def _step(me: _Flying, promised: tuple[PromisedView, ...]) -> tuple[_Flying, Observation | None]:
-    """Returns one view of one member, or its end.
+    """Takes the next frame of one member, or ends its mission.
 
-    A view that was recorded is lived through again.
+    A recorded frame is processed again instead.
     """
     mission, state = me.mission, me.state
     if promised:
@@ -514,7 +514,7 @@ def _step(me: _Flying, promised: tuple[PromisedView, ...]) -> tuple[_Flying, Obs
 
 
 def _decided_by(state: LoopState, policy: Policy) -> LoopState:
-    """Returns the state of a planner whose next decision is a policy's."""
+    """Returns the state with its planner's policy replaced."""
     return replace(state, planner=replace(state.planner, policy=policy))
 
 
@@ -526,7 +526,7 @@ def _stop_all(flying: list[_Flying], reason: StopReason, why: str) -> None:
 
 
 def _finish(me: _Flying, state: LoopState) -> Result:
-    """Returns records how a member ended."""
+    """Records how a member ended, and returns its result."""
     assert me.stop is not None
     stop = me.stop if me.recorder is None else me.recorder.record_end(state, me.stop)
     return Result(state, me.rows, stop.reason, stop.message)

@@ -118,7 +118,10 @@ class LatestWorker(Generic[Question, Answer]):
                 self._idle = None
 
     def _settled(self) -> tuple[int, Question] | None:
-        """Returns the newest question once none has followed it for a while; the lock is held."""
+        """Waits until no question has followed the newest for a while; the lock is held.
+
+        Returns None if there is no question, or the worker is closed.
+        """
         newest = -1
         while newest != self._asked and not self._closed:
             newest = self._asked
@@ -276,7 +279,7 @@ class App:
         self.controls.show_note(str(error) or type(error).__name__)
 
     def _heights(self, bounds: np.ndarray) -> tuple[float, float, float]:
-        """Returns the least, greatest and first height of the cut [m]."""
+        """Returns the lowest, highest and initial height of the cut [m]."""
         low, high = (float(z) for z in np.asarray(bounds)[:, 2])
         corners = np.array([[0.0, 0.0, high]])
         rows = self.story.rows
@@ -288,7 +291,10 @@ class App:
             self._add_view()
 
     def _prepare(self) -> bool:
-        """Returns something for later, while nothing is asked: first the views along the path."""
+        """Prepares something for later while the page is idle, first the views along the path.
+
+        Returns False if there is nothing left to prepare.
+        """
         if not self.story.is_live and self._num_added < len(self.story.rows):
             self._add_view()
             return True
@@ -326,6 +332,6 @@ class App:
 
 
 def _follows_camera(question: Query) -> bool:
-    """Returns whether the map's colors depend on where the dragged camera is."""
+    """Returns True if the map's colors depend on the position of the dragged camera."""
     settings = question.settings
     return settings.layer.has_score and settings.place != PLACES[0]

@@ -65,7 +65,7 @@ class SurfaceTerms(eqx.Module):
 def probe_positions(grid: OccupancyGrid, num: int = NUM_PROBES) -> np.ndarray:
     """Returns positions in known free space [m], evenly spread, [P, 3] float32, P <= num.
 
-    They are those of the probe views that a run's mean renderability is measured with.
+    They are those of the probe views that measure a run's mean renderability.
     """
     return np.asarray(probe_poses(grid, num)[:, :3, 3], dtype=np.float32)
 
@@ -78,7 +78,7 @@ def surface_terms(
     *,
     pad_to: int = 1,
 ) -> SurfaceTerms:
-    """Returns the terms of every voxel, averaged over the positions that see it.
+    """Computes the terms of every voxel, averaged over the positions that see it.
 
     Args:
         state: the map.
@@ -170,7 +170,7 @@ class Blocks:
         return len(self.rows)
 
     def mean(self, values: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-        """Returns the weighted mean over the voxels of each block.
+        """Computes the weighted mean over the voxels of each block.
 
         Args:
             values: of every row of the map, [N].
@@ -187,7 +187,7 @@ class Blocks:
 
 
 def blocks_of(map_state: MapState, budget: int = BUDGET) -> Blocks:
-    """Returns the voxels of a map in at most `budget` blocks, as fine as that allows.
+    """Groups the voxels of a map into at most `budget` blocks, as fine as that allows.
 
     Raises:
         ValueError: a budget without a block.
@@ -212,13 +212,13 @@ def blocks_of(map_state: MapState, budget: int = BUDGET) -> Blocks:
 
 
 def _packed(index: np.ndarray) -> np.ndarray:
-    """Returns one number per index [3, m] from 0 on."""
+    """Packs each index [3, m], from 0 on, into one number."""
     x, y, z = index
     return (x << 42) | (y << 21) | z
 
 
 def block_values(blocks: Blocks, terms: SurfaceTerms, quantity: str) -> np.ndarray:
-    """Returns R or a term per block, [n] in [0, 1]; NaN where no position sees any of its voxels.
+    """Computes R or a term per block, [n] in [0, 1]; NaN where no position sees any of its voxels.
 
     Raises:
         KeyError: there is no such term.
@@ -230,7 +230,7 @@ def block_values(blocks: Blocks, terms: SurfaceTerms, quantity: str) -> np.ndarr
 
 
 def block_causes(blocks: Blocks, capacity: int, reason: Reason) -> np.ndarray:
-    """Returns the cause that took most of what the voxels of each block lacked for a view, [n] int.
+    """Finds the cause with the largest share in the deficit of each block for a view, [n] int.
 
     Args:
         blocks: of the map that the view was chosen on.
@@ -252,7 +252,7 @@ _SHADE = 0.5
 
 
 def cause_colors(causes: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """Returns the color per block, [n, 3] uint8, of what `block_causes` found [n].
+    """Returns the color per block, [n, 3] uint8, of the causes from `block_causes` [n].
 
     Args:
         causes: per block; where none took anything, it is gray.
@@ -267,7 +267,7 @@ def cause_colors(causes: np.ndarray, own: np.ndarray) -> np.ndarray:
 def block_colors(
     blocks: Blocks, map_state: MapState, terms: SurfaceTerms | None, quantity: str
 ) -> np.ndarray:
-    """Returns the color per block, [n, 3] uint8.
+    """Computes the color per block, [n, 3] uint8.
 
     Args:
         blocks: of the map.

@@ -93,10 +93,7 @@ class Guide:
         self._thread = threading.Thread(target=self._decide, name="guide", daemon=True)
 
     def needs_anew(self, source: Source) -> bool:
-        """Returns True if what was mapped must be mapped again.
-
-        The vertical or the space has changed.
-        """
+        """Returns True if the vertical or the space has changed: everything must be mapped again."""
         if self._planner is None:
             return False
         old = self._alignment.rotation[2]
@@ -133,7 +130,10 @@ class Guide:
             self._questions.put((self._planner, frame))
 
     def _up(self, source: Source) -> np.ndarray:
-        """Returns the vertical; a guess is made again whenever there are twice as many frames."""
+        """Returns the vertical.
+
+        If it is estimated, the estimate is renewed whenever the number of frames has doubled.
+        """
         if self._up_name is not None:
             return up_of(self._up_name)
         if source.up is not None:
@@ -164,7 +164,7 @@ class Guide:
         )
 
     def _warnings(self, source: Source, arrival: Arrival) -> list[str]:
-        """Returns what is wrong with the latest frame beside those before it."""
+        """Describes the faults of the latest frame, compared with the frames before it."""
         camera, pose = source.camera(arrival.index), source.poses[arrival.index]
         self._recent.append((arrival.name, block_image(*arrival.picture, camera, pose)))
         names, images = zip(*self._recent, strict=True)
@@ -177,7 +177,7 @@ class Guide:
         ]
 
     def _has_arrived(self, frame: Frame) -> bool:
-        """Returns True if the camera is where it was sent, and looks there."""
+        """Returns True if the camera is at the target's position and faces the same way."""
         assert self._target is not None
         pose = np.asarray(frame.T_world_camera, np.float64)
         is_near = np.linalg.norm(pose[:3, 3] - self._target[:3, 3]) < _NEAR
@@ -209,7 +209,7 @@ class Guide:
         self._page.decided(frame, decision)
 
     def __enter__(self) -> "Guide":
-        """Returns the guide itself."""
+        """Starts the worker thread; returns the guide itself."""
         self._thread.start()
         return self
 

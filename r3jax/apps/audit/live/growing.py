@@ -73,10 +73,10 @@ def _stage_recording(path: Path, scratch: Path) -> Path:
 
 
 def _in_order(stems: list[str], poses: int) -> list[str]:
-    """Returns names that certainly belong to the first poses.
+    """Returns the names that certainly belong to the first poses.
 
-    With as many names as poses all do. Otherwise, if names are numbers, only those before the
-    first gap: a frame that is late would take another one's pose.
+    If there are as many names as poses, all of them do. Otherwise, if names are numbers, only those
+    before the first gap: a frame that is late would take another one's pose.
     """
     if len(stems) == poses or not all(stem.isdecimal() for stem in stems):
         return stems[:poses]
@@ -87,7 +87,7 @@ def _in_order(stems: list[str], poses: int) -> list[str]:
 
 
 def complete_lines(path: Path) -> list[str]:
-    """Returns lines of a text of poses that are whole: 16 numbers and an end.
+    """Reads the complete lines of a text of poses: 16 numbers and a line end.
 
     Raises:
         OSError: not permitted.
@@ -101,7 +101,7 @@ def complete_lines(path: Path) -> list[str]:
 
 
 def _stage_numbered(path: Path, scratch: Path) -> Path:
-    """Returns frames of 7-Scenes' layout: those with an image, a depth image and a pose."""
+    """Links the complete frames of 7-Scenes' layout: an image, a depth image and a pose each."""
     files = {entry.name: entry for entry in path.iterdir() if entry.name.startswith("frame-")}
     bases = {name.partition(".")[0] for name in files}
     kept: list[Path] = []
@@ -216,7 +216,11 @@ class GrowingCapture:
         return source, self._arrivals(source), self._has_moved(source)
 
     def _opened(self, files: list[Path]) -> Source:
-        """Returns the frames that are whole by now; raises ValueError, OSError where none is."""
+        """Opens the frames that are complete by now.
+
+        Raises:
+            ValueError, OSError: there are none.
+        """
         path = self._path.resolve()
         if self._bag is not None and files:
             return source_of(self._bag.images(files), path.stem)
@@ -225,7 +229,7 @@ class GrowingCapture:
         return source_of(images, (path.parent if path.is_file() else path).name)
 
     def _arrivals(self, source: Source) -> list[Arrival]:
-        """Returns the first of the new frames that can be read."""
+        """Reads the first of the new frames that can be read."""
         found: list[Arrival] = []
         self._is_pending, self.waiting_for = False, ""
         for index, key in enumerate(_keys(source)):
@@ -244,7 +248,7 @@ class GrowingCapture:
         return found
 
     def _has_moved(self, source: Source) -> bool:
-        """Returns True if poses of frames that are in were corrected; takes note of them."""
+        """Records corrected poses of frames that are in the map; returns True if there are any."""
         moved = False
         for index, key in enumerate(_keys(source)):
             if key not in self._taken:
@@ -256,7 +260,7 @@ class GrowingCapture:
         return moved
 
     def again(self, source: Source) -> Iterator[Arrival]:
-        """Yields all frames that came in and can still be read, one by one."""
+        """Yields all frames that were read before and can still be read, one by one."""
         for index, key in enumerate(_keys(source)):
             if key not in self._taken:
                 continue
@@ -279,7 +283,7 @@ def subset(source: Source, indices: list[int]) -> Source:
 
 
 def _keys(source: Source) -> list[str]:
-    """Returns names of all frames; equal ones get numbers."""
+    """Returns a unique key for each frame: its label, and a number among equal labels."""
     count: Counter[str] = Counter()
     keys: list[str] = []
     for label in source.labels:
@@ -289,9 +293,9 @@ def _keys(source: Source) -> list[str]:
 
 
 def _signature(path: Path) -> object:
-    """Returns what changes when a frame comes in.
+    """Returns a value that changes when a frame comes in.
 
-    Times of the folders, and of the texts in them.
+    It consists of the times of the folder and of its small files.
     """
     try:
         found = path.stat()

@@ -130,7 +130,7 @@ class GuidePage:
         )
 
     def _advice(self) -> dict[str, Any]:
-        """Returns the way from the latest frame to the target, in words."""
+        """Describes the path from the latest frame to the target."""
         target = self._target
         if not target:
             return {"next": "Keep on scanning ...", "note": "looking for the best view",
@@ -152,7 +152,7 @@ class GuidePage:
 
 
 def _from_above(pose: np.ndarray, camera: Camera) -> dict[str, float]:
-    """Returns the place, azimuth and half the field of view of a camera."""
+    """Returns the position, azimuth and half the field of view of a camera, seen from above."""
     forward = pose[:3, 2]
     level = float(np.hypot(*forward[:2]))
     half = float(np.arctan(0.5 * camera.width / float(camera.fx)))
@@ -304,7 +304,7 @@ def scan_progress(planner: Planner, camera: Camera, places: np.ndarray) -> ScanP
 def _plan(
     planner: Planner, value: np.ndarray, places: np.ndarray
 ) -> tuple[np.ndarray, tuple[float, float, float, float]]:
-    """Returns the place from above, cut to what is known; and its extent."""
+    """Draws the place from above, cut to the known part; also returns its extent."""
     height = float(np.median(places[:, 2]))
     picture, (left, right, bottom, _) = floor_picture(planner.map_state, planner.grid, height)
     pixel = (right - left) / picture.shape[1]

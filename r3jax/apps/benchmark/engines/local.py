@@ -117,7 +117,7 @@ class _Worker:
         self.pipe.send((cell, root))
 
     def receive(self) -> Any:
-        """Returns the next event of its cell; a process that died makes it a failure."""
+        """Waits for the next event of its cell; the death of the process counts as a failure."""
         assert self.pipe is not None
         assert self.cell is not None
         cell = self.cell
@@ -149,7 +149,7 @@ def _death(exit_code: int) -> str:
 
 
 def in_words(error: BaseException) -> str:
-    """Returns an error in one line."""
+    """Formats an error in one line."""
     return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
@@ -209,7 +209,7 @@ def _die_with_parent() -> None:
 def worker_environments(count: int) -> list[dict[str, str]]:
     """Returns the environment of each of `count` workers: its GPU and its share of memory or cores.
 
-    What the user has set is left alone.
+    Variables that the user has set are not changed.
     """
     gpus = visible_gpus()
     wanted: list[dict[str, str]] = []
@@ -229,9 +229,9 @@ def worker_environments(count: int) -> list[dict[str, str]]:
 
 
 def visible_gpus() -> list[str]:
-    """Returns what CUDA_VISIBLE_DEVICES may hold for one GPU each; empty without any.
+    """Returns a value of CUDA_VISIBLE_DEVICES for each GPU; empty without GPUs.
 
-    JAX is not asked: it would take the memory of all of them.
+    JAX is not used for this: it would reserve the memory of all GPUs.
     """
     if "CUDA_VISIBLE_DEVICES" in os.environ:
         given = os.environ["CUDA_VISIBLE_DEVICES"].split(",")

@@ -36,7 +36,7 @@ _PATIENCE = 60.0
 
 
 def ended_jobs(job_ids: Iterable[str]) -> dict[str, str]:
-    """Returns jobs that have ended, with their state and its reason in words.
+    """Queries the Slurm queue for jobs that have ended, with their state and its reason.
 
     Args:
         job_ids: as submitit has them: `12`, or `12_3` of an array.
@@ -66,9 +66,9 @@ def ended_jobs(job_ids: Iterable[str]) -> dict[str, str]:
 
 
 def read_queue(job_ids: Iterable[str], listing: str) -> dict[str, str]:
-    """Returns the jobs of `job_ids` that have ended, by lines `id|state|reason` of the queue.
+    """Finds the jobs that have ended in a listing of the queue, lines `id|state|reason`.
 
-    A job that is not listed ended so long ago that Slurm forgot it (its MinJobAge).
+    A job that is not listed ended so long ago that Slurm has dropped it (its MinJobAge).
     """
     listed: dict[str, tuple[str, str]] = {}
     for line in listing.splitlines():
@@ -107,7 +107,7 @@ class CellJob:
         return ""
 
     def checkpoint(self, cell: Cell, root: Path) -> Any:
-        """Returns what goes back into the queue: the same, since the folder knows how far it is."""
+        """Returns the job to put back into the queue; it continues from the files in its folder."""
         return _submitit().helpers.DelayedSubmission(self, cell, root)
 
 

@@ -43,7 +43,7 @@ class Chooser(Protocol):
     """Scores photos that were not chosen by their poses; it never gets their pixels."""
 
     def begin(self, known: Known) -> Any:
-        """Returns what it remembers before the first photo."""
+        """Returns the chooser's memory before the first photo."""
         ...
 
     def observe(self, memory: Any, known: Known, frame: Frame) -> Any:
@@ -73,17 +73,17 @@ class FisherChooser:
     form: Form
 
     def begin(self, known: Known) -> Any:
-        """Returns the nothing: information is that of the model as it is."""
+        """Returns None: the information is that of the model as it is."""
         return None
 
     def observe(self, memory: Any, known: Known, frame: Frame) -> Any:
-        """Returns the nothing."""
+        """Returns the memory unchanged."""
         return memory
 
     def score(
         self, memory: Any, known: Known, model: GaussianScene, poses: np.ndarray, *, key: jax.Array
     ) -> np.ndarray:
-        """Returns scores of `baselines.fisherrf`, at `_FISHER_WIDTH`."""
+        """Computes the scores of `baselines.fisherrf` at images `_FISHER_WIDTH` wide."""
         del memory, key
         camera = known.camera
         camera = camera.resized(*fitted_size(camera.width, camera.height, _FISHER_WIDTH))
@@ -112,7 +112,7 @@ class PolicyChooser:
     """True tells the policy that no cell is unexplored."""
 
     def begin(self, known: Known) -> Any:
-        """Returns the policy's state; nothing in it is random."""
+        """Returns the policy's initial state; nothing in it is random."""
         return self.policy.init(known.camera, known.grid, key=jax.random.key(0))
 
     def observe(self, memory: Any, known: Known, frame: Frame) -> Any:
@@ -122,7 +122,7 @@ class PolicyChooser:
     def score(
         self, memory: Any, known: Known, model: GaussianScene, poses: np.ndarray, *, key: jax.Array
     ) -> np.ndarray:
-        """Returns totals where no path costs anything."""
+        """Computes the policy's total score of each pose, as if no path cost anything."""
         del model
         where = known.situation(memory.memory, known_cells=self.known_cells)
         return totals_of(self.policy, where, poses, key=key)
@@ -159,7 +159,7 @@ def make_chooser(name: str, num_candidates: int, max_range: float) -> Chooser:
 
 
 def totals_of(policy: Any, where: Situation, poses: np.ndarray, *, key: jax.Array) -> np.ndarray:
-    """Returns what a policy gives each pose if no path costs anything, [K] float64."""
+    """Computes a policy's total score of each pose, as if no path cost anything, [K] float64."""
     if isinstance(policy, ActiveGamer):
         state, grid, scoring = where.map_state, where.grid, policy.scoring_for(where.grid)
         flat = poses.astype(np.float32)

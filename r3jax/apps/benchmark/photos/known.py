@@ -53,7 +53,7 @@ class Known:
     """Frames that were shown, in order."""
 
     def shown(self, frame: Frame) -> "Known":
-        """Returns the same with one frame more."""
+        """Adds a frame to the map, the grid and the chosen frames."""
         config = self.config
         grid = _integrate_depth(self.grid, frame, config.max_range)
         return replace(
@@ -64,7 +64,7 @@ class Known:
         )
 
     def situation(self, memory: Any, *, known_cells: bool = False) -> Situation:
-        """Returns what a policy is asked with.
+        """Returns the situation that a policy decides in.
 
         Args:
             memory: what it keeps beside the map.
@@ -81,7 +81,7 @@ class Known:
 def nothing_known(
     camera: Camera, bounds: np.ndarray, poses: np.ndarray, config: ExplorationConfig
 ) -> Known:
-    """Returns what is known before the first frame.
+    """Returns the empty map and grid before the first frame.
 
     Args:
         camera: that candidates are scored with.

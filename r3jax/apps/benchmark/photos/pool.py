@@ -47,7 +47,7 @@ class PhotoPool:
     """Numbers of the photos that judge, ascending."""
 
     def frame(self, number: int) -> Frame:
-        """Returns a photo at its full size, for the map."""
+        """Reads a photo at its full size, for the map."""
         source = self.capture.source
         return source.frame(source.rows[number].step if isinstance(source, Run) else number)
 
@@ -93,9 +93,7 @@ def _check_depth(capture: Capture) -> None:
 
 
 def first_photos(pool: PhotoPool, num: int, seed: int) -> list[int]:
-    """Returns the photos that every choice begins with.
-
-    Drawn by the seed, the same for all choosers.
+    """Draws the photos that every choice begins with, the same for all choosers of a seed.
 
     Raises:
         PhotosError: fewer are on offer.

@@ -82,11 +82,11 @@ class PhotoTerms:
         return self.gaussians // (self.first + self.choose)
 
     def mapping(self) -> ExplorationConfig:
-        """Returns settings of the map."""
+        """Returns the settings of the map."""
         return ExplorationConfig(voxel_size=self.voxel_size, max_range=self.max_range)
 
     def train_config(self, seed: int) -> TrainConfig:
-        """Returns settings of the one training."""
+        """Returns the settings of the single training."""
         return TrainConfig(
             iterations=self.choose * self.every + self.iterations,
             num_gaussians=self.first * self.per_photo,
@@ -179,10 +179,7 @@ class _Choice:
             self._take(number)
 
     def add(self, step: int, scene: GaussianScene) -> Addition:
-        """Returns what the training goes on with after a step.
-
-        One photo more, until all are chosen.
-        """
+        """Chooses one more photo, until all are chosen; returns photos and Gaussians to train next."""
         newborn = None
         if len(self.chosen) < self.terms.first + self.terms.choose:
             candidates = nearest_photos(self.pool, self.chosen, self.terms.nearest)
@@ -198,7 +195,7 @@ class _Choice:
         return Addition(self.views(step), newborn)
 
     def views(self, step: int) -> Views:
-        """Returns the photos for the steps up to the next choice, one a step.
+        """Draws the photos for the steps up to the next choice, one a step.
 
         As many as there are steps, so that nothing is recompiled when a photo joins; every photo
         is shown as often as any other, or once more.
@@ -216,8 +213,8 @@ class _Choice:
     def _as_trained(self, scene: GaussianScene, step: int) -> GaussianScene:
         """Returns the scene with the harmonics that are in training at a step.
 
-        The others are 0 and would get no gradient; but by how a pixel would move with them they
-        would count as what is known least.
+        The other coefficients are 0 and get no gradient. But pixels would change with them, so they
+        would count as the least known.
         """
         every = self.terms.train_config(self.seed).schedule().sh_every
         degree = min(step // every, scene.sh_degree)

@@ -28,7 +28,7 @@ Record = dict[str, Any]
 
 
 def record_path(root: Path, pool: PhotoPool, chooser: str, seed: int) -> Path:
-    """Returns where the record of a run is kept."""
+    """Returns the path of a run's record."""
     return root / "photos" / f"{pool.name}-{chooser}-seed{seed}.json"
 
 
@@ -42,7 +42,7 @@ def kept_or_made(
     lpips: ImageMetric | None = None,
     on_stage: OnStage = lambda stage: None,
 ) -> Record:
-    """Returns the record on equal terms that is there; otherwise runs the protocol and writes it.
+    """Reads the stored record on equal terms; without one, runs the protocol and stores its record.
 
     Args:
         root: folder of the benchmark.
@@ -85,7 +85,7 @@ def kept_or_made(
 
 
 def _fields(outcome: Outcome) -> Record:
-    """Returns what a run has come to, as plain numbers."""
+    """Returns the outcome of a run as plain numbers."""
     found = {summary.metric.name: summary for summary in summarize(outcome.rows)}
     return {
         "chosen": outcome.chosen,
@@ -102,9 +102,7 @@ def _fields(outcome: Outcome) -> Record:
 
 
 def table_rows(records: Sequence[Record]) -> list[dict[str, str]]:
-    """Returns a line per chooser, the best first.
-
-    Means with intervals, and what it has over `random`.
+    """Makes a table row per chooser, the best first: means with intervals, and gains over `random`.
 
     Args:
         records: of the same captures and seeds for all choosers.
@@ -131,7 +129,7 @@ def table_rows(records: Sequence[Record]) -> list[dict[str, str]]:
 
 
 def _lead(own: Sequence[Record], records: Sequence[Record]) -> str:
-    """Returns what a chooser has over `random` on the same photos that judge [dB]."""
+    """Writes a chooser's gain in PSNR over `random` on the same test photos [dB]."""
     floor = [record for record in records if record["chooser"] == "random"]
     runs = lambda part: sorted((record["capture"], record["seed"]) for record in part)
     if runs(floor) != runs(own):
@@ -140,7 +138,7 @@ def _lead(own: Sequence[Record], records: Sequence[Record]) -> str:
 
 
 def _scores(records: Sequence[Record], metric: str) -> dict[str, np.ndarray]:
-    """Returns one metric by capture, [seeds, photos that judge]."""
+    """Collects one metric by capture, [seeds, test photos]."""
     captures = dict.fromkeys(record["capture"] for record in records)
     return {
         capture: np.array(
