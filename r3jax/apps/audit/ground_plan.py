@@ -151,7 +151,7 @@ def ground_label(audit: Audit, axis: int) -> str:
 
 
 def axis_name(alignment: Alignment, axis: int) -> str | None:
-    """Returns the capture's axis along an axis of the audit, such as `-z`; None if there is none."""
+    """Returns the capture's axis along an axis of the audit, such as `-z`, or None."""
     direction = alignment.rotation[axis]
     best = int(np.argmax(np.abs(direction)))
     if abs(direction[best]) < 0.9999 or np.any(alignment.origin != 0.0):

@@ -61,7 +61,7 @@ def voxel_difficulty(state: MapState) -> Float[Array, " N"]:
 
 
 def difficulty_of_rows(state: MapState, row: Int[Array, " n"]) -> Float[Array, " n"]:
-    """Returns `voxel_difficulty` of some rows; 0 for row N, which is none."""
+    """Computes `voxel_difficulty` of some rows; 0 for row N, which stands for no voxel."""
     is_there = row < state.capacity
     at = jnp.where(is_there, row, 0)
     is_there &= state.present[at]

@@ -78,7 +78,7 @@ def follow_recording(
 
 
 def revisit_figure(recording: PosedImages, reports: list[FrameReport]) -> Figure:
-    """Returns the renderability before integration along the recording, and the path from above."""
+    """Draws the renderability before integration along the recording, and the path from above."""
     figure = style.new_figure(11.0, 4.2)
     left, right = figure.subplots(1, 2, width_ratios=[1.7, 1.0])
     index = np.array([report.index for report in reports])

@@ -92,7 +92,7 @@ class ReservedViews:
         *,
         key: Array,
     ) -> tuple[Decision | None, Any, PlanInfo]:
-        """Returns the view that the policy would take if the promised ones had been taken."""
+        """Chooses the view that the policy would take if the promised views had been taken."""
         # One after the other: what the first promises to show, the second cannot promise again.
         for view in self.promised:
             pose = jnp.asarray(view.T_world_camera, dtype=jnp.float32)

@@ -93,7 +93,7 @@ class Guide:
         self._thread = threading.Thread(target=self._decide, name="guide", daemon=True)
 
     def needs_anew(self, source: Source) -> bool:
-        """Returns True if the vertical or the space has changed: everything must be mapped again."""
+        """Returns True if the vertical or the space has changed and all must be mapped again."""
         if self._planner is None:
             return False
         old = self._alignment.rotation[2]

@@ -179,7 +179,7 @@ class _Choice:
             self._take(number)
 
     def add(self, step: int, scene: GaussianScene) -> Addition:
-        """Chooses one more photo, until all are chosen; returns photos and Gaussians to train next."""
+        """Chooses a photo until all are chosen; returns the photos and Gaussians to train next."""
         newborn = None
         if len(self.chosen) < self.terms.first + self.terms.choose:
             candidates = nearest_photos(self.pool, self.chosen, self.terms.nearest)
