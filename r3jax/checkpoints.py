@@ -67,7 +67,7 @@ def make_folder(folder: Path) -> None:
 
 
 def numbered(folder: Path) -> list[Path]:
-    """Returns the checkpoints in a folder, oldest first."""
+    """Lists the checkpoints in a folder, oldest first."""
     if is_link(folder):
         return []
     found = [path for path in folder.glob("[0-9]*") if _is_checkpoint(path)]
@@ -141,7 +141,7 @@ def _sha256(path: Path) -> str:
 
 
 def read_arrays(path: Path) -> dict[str, Any]:
-    """Returns the arrays of a checkpoint, nested as they were written.
+    """Reads the arrays of a checkpoint, nested as they were written.
 
     Raises:
         ForeignFileError: it is damaged, or cannot be read.

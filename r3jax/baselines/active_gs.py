@@ -325,7 +325,7 @@ class ActiveGS(GreedyPolicy):
         } | draw_lots(len(candidates.valid), key=key)
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
-        """Returns the utility's share minus the path's; random scores where all are 0."""
+        """Computes the utility's share minus the path's; random scores if all utilities are 0."""
         is_reachable = np.isfinite(utilities["path"])
         # All zero: the path alone would keep the robot where it is.
         if not np.any(utilities["utility"][is_reachable]):

@@ -75,9 +75,7 @@ def pixel_tallies(
     least_weight: float = 0.0,
     source: Source = "auto",
 ) -> tuple[Float[Array, "n 2"], Int[Array, ""]]:
-    """Returns sums over the pixels of a view, for each Gaussian.
-
-    Its weight times `value`, and `counts`.
+    """Sums `value`, times a Gaussian's weight, and `counts` over the pixels of a view.
 
     Args:
         scene: the Gaussians.
@@ -141,7 +139,7 @@ def _is_compiled(source: Source) -> bool:
 def _rows(
     camera_size: tuple[int, int], scene: GaussianScene, camera: Camera, pose: Array, behind: Array
 ) -> GaussianScene:
-    """Returns sums of squared gradients, one row of pixels after the other."""
+    """Sums squared gradients, one row of pixels after the other."""
     width, height = camera_size
     columns = jnp.arange(width, dtype=jnp.float32) + 0.5
 

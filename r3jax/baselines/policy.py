@@ -72,7 +72,7 @@ class OnlinePolicy(GreedyPolicy):
         return replace(state, memory=self.note(online))
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
-        """Returns the utility's share minus the path's; random scores where all are 0."""
+        """Computes the utility's share minus the path's; random scores if all utilities are 0."""
         is_reachable = np.isfinite(utilities["path"])
         # A map without Gaussians: the first candidate would be as good as any, but always the same.
         if not np.any(utilities["utility"][is_reachable]):

@@ -168,7 +168,7 @@ def _look_round(
 
 
 def _cone_angle(camera: Camera) -> Float[Array, ""]:
-    """Returns half the smaller field of view [rad]."""
+    """Computes half the smaller field of view [rad]."""
     return jnp.minimum(
         jnp.arctan(0.5 * camera.width / camera.fx), jnp.arctan(0.5 * camera.height / camera.fy)
     )

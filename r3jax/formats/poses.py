@@ -132,8 +132,8 @@ def read_poses(path: Path) -> np.ndarray:
 def up_of_poses(poses: np.ndarray) -> np.ndarray | None:
     """Returns the vertical of a data set whose world has z up, [3].
 
-    None where the first pose is the identity: then another program wrote it in this layout, whose
-    world is the first camera.
+    It is None if the first pose is the identity: then another program wrote it in this layout,
+    whose world is the first camera.
     """
     return None if np.allclose(poses[0], np.eye(4), atol=1e-6) else UP_Z
 

@@ -258,7 +258,7 @@ def sums(
     rows: MapRows, cells: Cells, views: Views, layout: Layout, forms: Forms,
     num_bins: int, voxel_bins: int, *, keep: bool = False,
 ) -> tuple[Array, ...]:  # fmt: skip
-    """Returns sums what views show, by direction: `scoring.formulas.sums_in_view`.
+    """Sums what views show, by direction: `scoring.formulas.sums_in_view`.
 
     Args:
         rows: of the map.
@@ -293,7 +293,7 @@ def changes(
     position: Float[Array, "P 3"], focal: Float[Array, " P"], forms: Forms,
     num_bins: int, voxel_bins: int,
 ) -> tuple[Float[Array, "P B"], Float[Array, "P B"]]:  # fmt: skip
-    """Returns sums what imagined views have changed: `scoring.formulas.change_of_sums`.
+    """Sums what imagined views have changed: `scoring.formulas.change_of_sums`.
 
     Args:
         before: rows of the map before the views.

@@ -91,7 +91,7 @@ def check_claims(path: Path, tree: dict[str, Any]) -> None:
 
 
 def _stored(path: Path, tree: dict[str, Any]) -> int:
-    """Returns bytes of a file and of those beside it that its buffers name, each once."""
+    """Sums the bytes of a file and of the files that its buffers name, each once."""
     names = {
         _part(buffer, "uri", str, "") for buffer in _part(tree, "buffers", list[dict[str, Any]], [])
     }
@@ -108,7 +108,7 @@ def _stored(path: Path, tree: dict[str, Any]) -> int:
 def _accessor_size(
     number: int, accessor: dict[str, Any], views: list[dict[str, Any]], lengths: list[int]
 ) -> tuple[int, int]:
-    """Returns numbers in an accessor, and their bytes."""
+    """Counts the numbers in an accessor, and their bytes."""
     if "bufferView" not in accessor or "sparse" in accessor:
         raise ForeignFileError(
             f"accessor {number} has no buffer view of its own: compressed and sparse meshes are "
@@ -148,7 +148,7 @@ def _at(items: list[Any], index: int, what: str) -> Any:
 
 
 def _whole(tree: dict[str, Any], name: str, default: int | None = None) -> int:
-    """Returns an entry that is a whole number >= 0."""
+    """Reads an entry that must be a whole number >= 0."""
     value = tree.get(name, default)
     check_type(name, value, int)
     if value < 0:
@@ -168,14 +168,14 @@ def _check_extensions(tree: dict[str, Any]) -> None:
 
 
 def num_lines(tree: dict[str, Any]) -> int:
-    """Returns primitives that are lines: of a tree that `check_claims` let through."""
+    """Counts the primitives that are lines, in a tree that passed `check_claims`."""
     meshes = _part(tree, "meshes", list[dict[str, Any]], [])
     modes = [primitive.get("mode") for mesh in meshes for primitive in mesh.get("primitives", [])]
     return sum(mode in _LINES for mode in modes)
 
 
 def texture_transforms(tree: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Returns how each material of a glTF file moves the texture coordinates of its base color.
+    """Reads how each material of a glTF file moves the texture coordinates of its base color.
 
     The extension is defined by the Khronos group: uv' = translation * rotation * scale * uv, in
     glTF's own coordinates, where v grows downwards.
@@ -202,14 +202,14 @@ def texture_transforms(tree: dict[str, Any]) -> dict[str, np.ndarray]:
 
 
 def _part(tree: dict[str, Any], name: str, kind: Any, default: Any) -> Any:
-    """Returns an optional entry of the tree, with its type checked."""
+    """Reads an optional entry of the tree, and checks its type."""
     value = tree.get(name, default)
     check_type(name, value, kind)
     return value
 
 
 def _affine(settings: dict[str, Any]) -> np.ndarray:
-    """Returns the map of one material, [3, 3]."""
+    """Computes the affine map of one material, [3, 3]."""
     offset = _part(settings, "offset", list[float], [0.0, 0.0])
     scale = _part(settings, "scale", list[float], [1.0, 1.0])
     angle = _part(settings, "rotation", float, 0.0)
@@ -228,9 +228,9 @@ def _affine(settings: dict[str, Any]) -> np.ndarray:
 
 
 def read_tree(path: Path) -> dict[str, Any]:
-    """Returns the JSON of a `.glb` or `.gltf` file.
+    """Reads the JSON of a `.glb` or `.gltf` file.
 
-    Of a GLB it is the first chunk, behind 20 bytes.
+    In a GLB it is the first chunk, after 20 bytes.
 
     Raises:
         ForeignFileError: a chunk that is longer than the file; no JSON, or none of a glTF file.
@@ -328,9 +328,9 @@ class MeshFile:
         self._check_repeats()
 
     def texture(self, image: Any) -> np.ndarray:
-        """Returns the texels of one of its images, [h, w, 3] uint8.
+        """Unpacks one of its images, [h, w, 3] uint8.
 
-        Unpacked once, however often asked.
+        Each image is unpacked once, and cached.
 
         Raises:
             ForeignFileError: not an image of a usual format, damaged, or far too large.

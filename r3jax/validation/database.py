@@ -86,7 +86,7 @@ def _check_table(connection: sqlite3.Connection, table: str) -> None:
 
 
 def query_database(path: str | Path, sql: str, values: Sequence[Any] = ()) -> list[Any]:
-    """Returns all rows of a query; reads only, even while another program has it open.
+    """Reads all rows of a query, without writing, even while another program has it open.
 
     Raises:
         ForeignFileError: more rows or bytes than a capture has, or a query without an end.

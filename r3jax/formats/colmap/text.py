@@ -76,7 +76,7 @@ def _lines(path: Path) -> Iterator[_Line]:
 
 
 def _rows(path: Path) -> Iterator[_Line]:
-    """Returns the lines that are neither empty nor comments."""
+    """Yields the lines that are neither empty nor comments."""
     return (line for line in _lines(path) if _is_row(line))
 
 

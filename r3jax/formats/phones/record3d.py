@@ -175,7 +175,7 @@ def _depth(archive: Archive, decoder: Any, size: tuple[int, int] | None, shot: S
 
 
 def _turned(count: int, lens: Lens) -> tuple[int, int]:
-    """Returns rows and columns for this number of values, turned as the image is."""
+    """Finds rows and columns for this number of values, turned as the image is."""
     longer, shorter = next(size for size in _DEPTH_SIZES if count == size[0] * size[1])
     return (longer, shorter) if lens.height > lens.width else (shorter, longer)
 

@@ -136,7 +136,7 @@ class BagReading:
                 add_transforms(self._tree, one, but=None if pose is None else pose.child)
 
     def images(self, choose: Choice | None = None) -> PosedImages:
-        """Returns the posed images of what was added so far; raises FormatError as `read_bag`.
+        """Builds the posed images of all that was added so far; raises FormatError as `read_bag`.
 
         Args:
             choose: tells which of the images to take, in the order of time; None: all that have

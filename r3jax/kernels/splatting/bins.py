@@ -31,7 +31,7 @@ _ZERO = np.float32(0.0)
 
 @inlined
 def pixel_range(low, high, size):
-    """Returns first and last pixel whose center lies in [low, high], within the image."""
+    """Finds the first and last pixel whose center lies in [low, high], within the image."""
     first = np.ceil(max(low, _ZERO) - _HALF)
     last = np.floor(min(high, np.float32(size)) - _HALF)
     # Comparisons in floats first: a far-away bound would not fit an integer.

@@ -86,7 +86,7 @@ class Frontier(GreedyPolicy):
         return candidates, {"lot": before}
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
-        """Returns minus the path length, or random scores."""
+        """Returns the negative path length, or random scores."""
         return utilities.get("lot", -utilities["path"])
 
     def conclude(

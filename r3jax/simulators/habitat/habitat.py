@@ -218,7 +218,7 @@ class HabitatSimulator:
 def _shared_habitat(
     library: tuple[Any, Any, Any], file: Path, size: tuple[int, int], fov: float, gpu: int
 ) -> "_Habitat":
-    """Returns the simulator of a scene, camera and device, opened: an existing one if there is."""
+    """Opens the simulator of a scene, camera and device, or reuses the open one."""
     key = file, size, fov, gpu
     habitat = _SHARED.get(key)
     if habitat is None:

@@ -55,7 +55,7 @@ class TileBoxes(eqx.Module):
 
 
 def grid_shape(width: int, height: int) -> tuple[int, int]:
-    """Returns columns and rows of tiles in an image of this size [px]."""
+    """Computes columns and rows of tiles in an image of this size [px]."""
     return -(-width // TILE), -(-height // TILE)
 
 

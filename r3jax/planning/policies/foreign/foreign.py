@@ -228,7 +228,7 @@ class Foreign:
             session.program.close()
 
     def _session(self, memory: Any) -> tuple[_Session, int]:
-        """Returns the session of a memory, and the number of frames that it has observed.
+        """Finds the session of a memory, and the number of frames that it has observed.
 
         Raises:
             PolicyError: it has ended.
