@@ -84,7 +84,7 @@ def low_confidence(
     """Per cell the number of voxels of low confidence, and the sum of their normals."""
     cell = world_to_cell(grid, state.center.T)
     shape = grid.log_odds.shape
-    is_low = state.occupied & (seen.confidence < LOW_CONFIDENCE)
+    is_low = state.present & (seen.confidence < LOW_CONFIDENCE)
     flat = jnp.zeros(state.capacity, dtype=jnp.int32)
     for axis, n in enumerate(shape):
         # The map has no bounds, the grid has: voxels outside lie in no cell.

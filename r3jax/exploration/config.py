@@ -126,6 +126,10 @@ def check_voxel_size(voxel_size: float, max_range: float) -> None:
 class ExplorationConfig(MappingConfig):
     """What the loop itself decides, mapping included; the policy has its own settings."""
 
+    remove_moved: bool = False
+    """Remove voxels that frames see through. Off, as in every run recorded before there was such
+    a setting: nothing moves in the worlds of a simulator."""
+
     speed: float = 1.0
     """Flight speed [m/s] where the policy's motion has none; turning takes no time then."""
 

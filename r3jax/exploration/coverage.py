@@ -115,7 +115,7 @@ def measure_coverage(
     unexplored = np.asarray(grid.unexplored)
     known = int(unexplored.size - unexplored.sum())
     return Coverage(
-        voxels=int(map_state.num_occupied),
+        voxels=int(map_state.num_present),
         map_bytes=map_state.bytes_per_row * map_state.capacity,
         dropped=int(map_state.dropped),
         known_cells=known,

@@ -7,6 +7,7 @@ compiled. Each is held to its formula by a test.
 |---|---|---|
 | `map_add` | `mapping.update.integrate_pixels` | `mapping/test_kernels.py` |
 | `map_mark` | `mapping.seen.rows_in_view`, `mark_rows` | `mapping/test_kernels.py` |
+| `map_miss` | `mapping.moved.count_misses` | `mapping/test_moved.py` |
 | `sums` | `scoring.formulas.sums_in_view` | `scoring/test_backends.py` |
 | `changes` | `scoring.formulas.change_of_sums` | `scoring/test_backends.py` |
 | `pixels` | `scoring.formulas.rows_in_pixels` | `scoring/test_backends.py` |

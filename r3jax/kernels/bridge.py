@@ -10,6 +10,7 @@ import numpy as np
 from r3jax.kernels.calls import Cells, FrameArrays, Layout, MapRows, Views
 from r3jax.kernels.mapping.add import map_add
 from r3jax.kernels.mapping.mark import map_mark
+from r3jax.kernels.mapping.miss import map_miss
 from r3jax.kernels.native.compiled import inlined
 from r3jax.kernels.native.ffi import (
     ARGUMENTS,
@@ -129,6 +130,24 @@ def _map_mark(frame):
         bytes1(frame, ARGUMENTS, 15),
         ints2(frame, ARGUMENTS, 16),
         floats2(frame, ARGUMENTS, 17),
+        np.int64(ints1(frame, ARGUMENTS, 18)[0]),
+    )
+    return 0
+
+
+def _map_miss(frame):
+    """Arguments: counts, m2, mean, misses, key, resolution, voxel size, frame (11), workers."""
+    if answers_metadata(frame):
+        return 0
+    map_miss(
+        floats1(frame, RESULTS, 0),
+        floats1(frame, RESULTS, 1),
+        floats2(frame, RESULTS, 2),
+        bytes1(frame, RESULTS, 3),
+        words2(frame, ARGUMENTS, 4),
+        floats1(frame, ARGUMENTS, 5),
+        float0(frame, ARGUMENTS, 6),
+        _image(frame, 7),
         np.int64(ints1(frame, ARGUMENTS, 18)[0]),
     )
     return 0
@@ -351,6 +370,7 @@ HANDLERS = {
     "sums": _sums,
     "map_mark": _map_mark,
     "map_add": _map_add,
+    "map_miss": _map_miss,
     "pixels": _pixels,
     "changes": _changes,
     "terms": _terms,

@@ -254,6 +254,30 @@ def map_mark(
     return rows._replace(visited=visited, resolution=resolution)
 
 
+def map_miss(
+    rows: MapRows, mean: Float[Array, "3 N"], misses: UInt8[Array, " N"], frame: FrameArrays
+) -> tuple[MapRows, Float[Array, "3 N"], UInt8[Array, " N"]]:
+    """Counts looks through each voxel and removes those that were looked through, in place.
+
+    The formula is `mapping.moved.count_misses`.
+
+    Args:
+        rows: of the map.
+        mean: colors of the rows.
+        misses: looks through each row so far.
+        frame: the frame.
+    """
+    changing = [rows.counts, rows.m2, mean, misses]
+    counts, m2, mean, misses = _call(
+        "map_miss",
+        [*map(_like, changing)],
+        (changing, rows.key, rows.resolution, rows.voxel_size, frame, _workers()),
+        input_output_aliases={i: i for i in range(4)},
+        vmap_method="sequential",
+    )
+    return rows._replace(counts=counts, m2=m2), mean, misses
+
+
 def sums(
     rows: MapRows, cells: Cells, views: Views, layout: Layout, forms: Forms,
     num_bins: int, voxel_bins: int, *, keep: bool = False,

@@ -94,3 +94,31 @@ SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 """Of Adam: decay of the moments of first and second order, and what keeps its step finite."""
+
+SLACK_EDGES = 2.0
+"""A measurement within this many edges of a voxel's center, along the axis, confirms the voxel."""
+
+SLACK_NOISE = 0.03
+"""The same, added as a share of the depth: three sigma of 1 % noise."""
+
+HALF_DIAGONAL = 0.867
+"""Half the diagonal of a voxel, in edges: its footprint in an image is within this."""
+
+MOST_HALF = 31
+"""Largest half footprint [px]: what fills more of an image is too close to be judged."""
+
+LEAST_FOOTPRINT = 1.5
+"""Smallest edge of a voxel in an image [px]; what is smaller is too far to be judged."""
+
+NEAR_ENOUGH = 1.0 / 3.0
+"""A look counts against a voxel if its resolution is at least this share of the best one: a thin
+thing that was measured from near by is not removed from afar, where pixels miss it."""
+
+FEW_OBSERVATIONS = 2
+"""Voxels with at most this number of observations are doubted sooner."""
+
+MISSES_OF_FEW = 2
+"""Looks through a voxel of few observations, without a confirmation between, that remove it."""
+
+MISSES = 3
+"""The same for a voxel of more observations."""

@@ -32,6 +32,10 @@ class MappingConfig:
     drop_edges: bool = True
     """Keep pixels on depth edges, whose color mixes two surfaces, out of the map."""
 
+    remove_moved: bool = True
+    """Remove voxels that frames see through, such as a person who has walked on, and stray
+    measurements: one byte a row."""
+
     cell_size: float = 0.2
     """Edge of a cell of the coarse grid [m]."""
 

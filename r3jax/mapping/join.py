@@ -10,7 +10,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, UInt32
+from jaxtyping import Array, Bool, Float, Int, UInt8, UInt32
 
 from r3jax.errors import InputError
 from r3jax.geometry.arguments import checked
@@ -43,6 +43,9 @@ class Statistics(eqx.Module):
 
     resolution: Float[Array, " M"]
     """Best resolution [px/m]."""
+
+    misses: UInt8[Array, " M"] | None = None
+    """Looks through each voxel; None: none, as of an observation."""
 
 
 Moments = tuple[Float[Array, " M"], Float[Array, "3 M"], Float[Array, " M"]]
@@ -83,20 +86,36 @@ def join(state: MapState, new: Statistics) -> MapState:
 
     # New rows read zeros here: an empty row has zero moments, so joining is inserting.
     before = at(state.count), at(state.mean), at(state.m2)
+    # A row whose voxel was removed keeps its place in the table; its marks are void.
+    is_known = before[0] > 0.0
+    bins = jnp.where(is_known[None, :], at(state.visited), jnp.uint32(0))
+    sharpness = jnp.where(is_known, at(state.resolution), 0.0)
     count, mean, m2 = combine_moments(before, (new.count, new.mean, new.m2))
     # Counted, not raised: inside jit a full table can only be told of.
     is_lost = new.valid & (row >= state.capacity)
     return MapState(
         key=key,
-        visited=put(state.visited, at(state.visited) | new.visited),
+        visited=put(state.visited, bins | new.visited),
         count=put(state.count, count),
         mean=put(state.mean, mean),
         m2=put(state.m2, m2),
-        resolution=put(state.resolution, jnp.maximum(at(state.resolution), new.resolution)),
+        resolution=put(state.resolution, jnp.maximum(sharpness, new.resolution)),
         voxel_size=state.voxel_size,
         dropped=state.dropped + jnp.sum(is_lost, dtype=jnp.int32),
         num_bins=state.num_bins,
+        misses=_joined_misses(state, new, row, is_known),
     )
+
+
+def _joined_misses(
+    state: MapState, new: Statistics, row: Int[Array, " M"], is_known: Bool[Array, " M"]
+) -> UInt8[Array, " N"] | None:
+    """Looks through each row: the fewer of the two where both know the voxel."""
+    if state.misses is None or new.misses is None:
+        return state.misses
+    before = state.misses.at[row].get(mode="fill", fill_value=0)
+    fewer = jnp.where(is_known, jnp.minimum(before, new.misses), new.misses)
+    return state.misses.at[row].set(fewer, mode="drop")
 
 
 @jax.jit
@@ -113,12 +132,14 @@ def _join_map(state: MapState, other: MapState) -> MapState:
             state,
             Statistics(
                 key=rows(other.key),
-                valid=rows(other.occupied),
+                # Rows of removed voxels are left behind.
+                valid=rows(other.present),
                 count=rows(other.count),
                 mean=rows(other.mean),
                 m2=rows(other.m2),
                 visited=rows(other.visited),
                 resolution=rows(other.resolution),
+                misses=None if other.misses is None else rows(other.misses),
             ),
         )
 
@@ -155,7 +176,8 @@ def grow(state: MapState, capacity: int) -> MapState:
     """
     if capacity < state.capacity:
         raise InputError(f"cannot shrink a map of {state.capacity} rows to {capacity}")
-    larger = empty_map(capacity, float(state.voxel_size), state.num_bins)
+    remove_moved = state.misses is not None
+    larger = empty_map(capacity, float(state.voxel_size), state.num_bins, remove_moved=remove_moved)
     # The very bits: a rounded edge would move voxel borders.
     larger = eqx.tree_at(lambda m: m.voxel_size, larger, state.voxel_size)
     return _join_map(larger, state)

@@ -164,6 +164,28 @@ def rows_in_view(state: MapState, frame: Frame, max_range: Float[Array, ""]) -> 
     other voxel hides: the color image shows what lies behind glass anyway, and whatever
     the map does not know of is in front of it in every later view from here, too.
     """
+    is_in, z, row, column = project_rows(state, frame, max_range)
+    # On a slope the depth changes within a pixel: the farthest of its neighbors limits.
+    farthest = jax.lax.reduce_window(frame.depth, 0.0, jax.lax.max, (3, 3), (1, 1), "SAME")
+    # A hole stays a hole: what its neighbors measure says nothing of its own ray.
+    farthest = jnp.where(frame.depth > 0.0, farthest, 0.0).reshape(-1)
+    pixel = row * frame.camera.width + column
+    measured = farthest[pixel]
+    # One edge of slack: a surface may lie anywhere within its voxel.
+    is_shown = (measured > 0.0) & (z <= measured + state.voxel_size)
+    is_hole = frame.depth.reshape(-1)[pixel] == 0.0
+    return is_in & (is_shown | (is_hole & hidden_by_none(state, frame, max_range)))
+
+
+def project_rows(
+    state: MapState, frame: Frame, max_range: Float[Array, ""]
+) -> tuple[Bool[Array, " N"], Float[Array, " N"], Int[Array, " N"], Int[Array, " N"]]:
+    """Projects the centers of voxels into a frame.
+
+    Returns:
+        Whether each lies in the image and within range, its z-depth [m], and its pixel: row and
+        column, some pixel of the image where it does not.
+    """
     camera, T = frame.camera, invert_pose(frame.T_world_camera)
     center = state.center
 
@@ -178,19 +200,10 @@ def rows_in_view(state: MapState, frame: Frame, max_range: Float[Array, ""]) -> 
     is_in &= (v >= 0.0) & (v < camera.height)
     # Straight from the camera, as the grid and the scores have it; depth alone is along the axis.
     is_in &= x * x + y * y + z * z <= max_range * max_range
-    # On a slope the depth changes within a pixel: the farthest of its neighbors limits.
-    farthest = jax.lax.reduce_window(frame.depth, 0.0, jax.lax.max, (3, 3), (1, 1), "SAME")
-    # A hole stays a hole: what its neighbors measure says nothing of its own ray.
-    farthest = jnp.where(frame.depth > 0.0, farthest, 0.0).reshape(-1)
     # Clipped before the cast: voxels out of the image lie anywhere, and are masked.
     column = jnp.clip(u, 0.0, camera.width - 1.0).astype(jnp.int32)
     row = jnp.clip(v, 0.0, camera.height - 1.0).astype(jnp.int32)
-    pixel = row * camera.width + column
-    measured = farthest[pixel]
-    # One edge of slack: a surface may lie anywhere within its voxel.
-    is_shown = (measured > 0.0) & (z <= measured + state.voxel_size)
-    is_hole = frame.depth.reshape(-1)[pixel] == 0.0
-    return is_in & (is_shown | (is_hole & hidden_by_none(state, frame, max_range)))
+    return is_in, z, row, column
 
 
 def hidden_by_none(state: MapState, frame: Frame, max_range: Float[Array, ""]) -> Bool[Array, " N"]:

@@ -14,7 +14,7 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, UInt32
+from jaxtyping import Array, Bool, Float, Int, UInt8, UInt32
 
 from r3jax.errors import InputError
 from r3jax.geometry.arguments import one
@@ -24,7 +24,7 @@ from r3jax.visibility.depth_buffer import Voxels
 
 
 class MapState(eqx.Module):
-    """Everything the map remembers between frames: 40 bytes a row.
+    """Everything the map remembers between frames: 40 bytes a row, 41 where voxels are removed.
 
     Invariants: `m2 >= 0`; a bin once visited stays visited; `dropped` never decreases; a key
     occurs once.
@@ -57,6 +57,10 @@ class MapState(eqx.Module):
     num_bins: int = eqx.field(static=True)
     """Direction bins B."""
 
+    misses: UInt8[Array, " N"] | None = None
+    """Frames that saw through the voxel since it was last measured (`mapping.moved`); None: no
+    voxel is ever removed."""
+
     @property
     def capacity(self) -> int:
         """Number of rows N."""
@@ -66,13 +70,13 @@ class MapState(eqx.Module):
     @property
     @jax.jit
     def occupied(self) -> Bool[Array, " N"]:
-        """True for rows that describe a voxel."""
+        """True for rows in use: they describe a voxel, or one that was removed."""
         # One word decides: the top bit of a packed key's high word is 0.
         return self.key[1] != jnp.uint32(EMPTY_WORD)
 
     @property
     def present(self) -> Bool[Array, " N"]:
-        """True for rows that describe a voxel that was seen; of rows that were taken, a part."""
+        """True for rows that describe a voxel: not one that was removed, nor padding."""
         return self.count > 0.0
 
     @property
@@ -101,6 +105,7 @@ class MapState(eqx.Module):
             mean=self.mean[:, row],
             m2=self.m2[row],
             resolution=self.resolution[row],
+            misses=None if self.misses is None else self.misses[row],
         )
 
     @property
@@ -122,17 +127,28 @@ class MapState(eqx.Module):
         return jnp.sum(self.occupied, dtype=jnp.int32)
 
     @property
+    @jax.jit
+    def num_present(self) -> Int[Array, ""]:
+        """Number of voxels."""
+        return jnp.sum(self.present, dtype=jnp.int32)
+
+    @property
     def bytes_per_row(self) -> int:
         """Memory of one row [bytes]."""
         rows = (self.key, self.visited, self.count, self.mean, self.m2, self.resolution)
-        return sum(x.nbytes for x in rows) // self.capacity
+        misses = 0 if self.misses is None else self.misses.nbytes
+        return (sum(x.nbytes for x in rows) + misses) // self.capacity
 
 
 a_map = one(MapState, "r3jax.empty_map makes one", leaf="count", ndim=1)
 
 
 def empty_map(
-    capacity: int = 1 << 17, voxel_size: float | int = 0.05, num_bins: int = 64
+    capacity: int = 1 << 17,
+    voxel_size: float | int = 0.05,
+    num_bins: int = 64,
+    *,
+    remove_moved: bool = False,
 ) -> MapState:
     """Makes a map without any observation.
 
@@ -140,6 +156,8 @@ def empty_map(
         capacity: rows of the table; a power of two.
         voxel_size: edge of a voxel [m].
         num_bins: direction bins per voxel.
+        remove_moved: remove voxels that frames see through, such as a person who has walked on;
+            one byte a row.
 
     Raises:
         ValueError: a capacity that is not a power of two, a size that is not positive and
@@ -151,11 +169,13 @@ def empty_map(
         raise InputError(f"voxel_size must be positive and finite [m], got {voxel_size}")
     if num_bins < 1:
         raise InputError(f"num_bins must be at least 1, got {num_bins}")
-    return _empty_map(capacity, float(voxel_size), num_bins)
+    return _empty_map(capacity, float(voxel_size), num_bins, remove_moved)
 
 
-@partial(jax.jit, static_argnums=(0, 2))
-def _empty_map(capacity: int, voxel_size: Float[Array, ""], num_bins: int) -> MapState:
+@partial(jax.jit, static_argnums=(0, 2, 3))
+def _empty_map(
+    capacity: int, voxel_size: Float[Array, ""], num_bins: int, remove_moved: bool
+) -> MapState:
     num_words = -(-num_bins // 32)
     return MapState(
         key=jnp.full((2, capacity), EMPTY_WORD, dtype=jnp.uint32),
@@ -167,4 +187,5 @@ def _empty_map(capacity: int, voxel_size: Float[Array, ""], num_bins: int) -> Ma
         voxel_size=jnp.asarray(voxel_size, dtype=jnp.float32),
         dropped=jnp.zeros((), dtype=jnp.int32),
         num_bins=num_bins,
+        misses=jnp.zeros(capacity, dtype=jnp.uint8) if remove_moved else None,
     )

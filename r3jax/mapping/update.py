@@ -30,6 +30,7 @@ from r3jax.mapping.associate import (
     points_of_pixels,
 )
 from r3jax.mapping.join import Statistics, grow, join
+from r3jax.mapping.moved import count_misses
 from r3jax.mapping.seen import evidence_of_view, hidden_by_none, mark_seen
 from r3jax.mapping.state import MapState, a_map
 
@@ -126,7 +127,8 @@ def _by_formulas(
     state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
 ) -> MapState:
     # Pixels first: new voxels hide what lies behind them in this very frame.
-    return mark_seen(integrate_pixels(state, frame, max_range, drop_edges), frame, max_range)
+    after = integrate_pixels(state, frame, max_range, drop_edges)
+    return mark_seen(count_misses(after, frame, max_range), frame, max_range)
 
 
 def _by_kernels(
@@ -137,6 +139,9 @@ def _by_kernels(
     # An unsound pose makes the range NaN, which no depth is below: the frame adds nothing.
     image = for_kernels(frame, factor * max_range, drop_edges)
     rows, mean, lost = calls.map_add(state.rows, state.mean, image, state.num_bins)
+    rows, misses = rows._replace(voxel_size=factor * rows.voxel_size), state.misses
+    if misses is not None:
+        rows, mean, misses = calls.map_miss(rows, mean, misses, image)
     after = MapState(
         key=rows.key,
         visited=rows.visited,
@@ -144,9 +149,10 @@ def _by_kernels(
         mean=mean,
         m2=rows.m2,
         resolution=rows.resolution,
-        voxel_size=factor * rows.voxel_size,
+        voxel_size=rows.voxel_size,
         dropped=state.dropped + lost,
         num_bins=state.num_bins,
+        misses=misses,
     )
     is_visible = hidden_by_none(after, frame, max_range).astype(jnp.uint8)
     rows = calls.map_mark(after.rows, image, is_visible, state.num_bins)

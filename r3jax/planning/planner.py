@@ -110,7 +110,7 @@ def start(
     # A fixed default: a plug-in without a seed still decides the same way twice.
     key = jax.random.key(0) if key is None else key
     grid = first_grid(np.asarray(bounds, dtype=np.float64), starts, config)
-    map_state = empty_map(config.capacity, config.voxel_size, config.num_bins)
+    map_state = first_map(config)
     return Planner(map_state, grid, policy.init(camera, grid, key=key), policy, config)
 
 
@@ -381,6 +381,12 @@ def follow(planner: Planner, T_world_camera: np.ndarray, waypoints: np.ndarray) 
     return replace(planner, policy_state=policy_state)
 
 
+def first_map(config: MappingConfig) -> MapState:
+    """Makes the map before the first view."""
+    size = (config.capacity, config.voxel_size, config.num_bins)
+    return empty_map(*size, remove_moved=config.remove_moved)
+
+
 def first_grid(
     bounds: np.ndarray, starts: Iterable[ArrayLike], config: MappingConfig
 ) -> OccupancyGrid:
@@ -391,8 +397,14 @@ def first_grid(
         starts: start poses, [4, 4] each; several cameras may start at several places.
         config: size of the cells and of the ball.
     """
+    return mark_starts(empty_grid(bounds, config.cell_size), starts, config)
+
+
+def mark_starts(
+    grid: OccupancyGrid, starts: Iterable[ArrayLike], config: MappingConfig
+) -> OccupancyGrid:
+    """Marks the ball round each start as free."""
     # No image shows the ball round the start; without it the robot stands in the unknown.
-    grid = empty_grid(bounds, config.cell_size)
     for pose in starts:
         position = jnp.asarray(np.asarray(pose)[:3, 3], dtype=jnp.float32)
         grid = _mark_free_ball(grid, position, config.start_radius)

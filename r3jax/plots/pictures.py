@@ -64,7 +64,7 @@ def floor_picture(
     picture[np.asarray(grid.occupied)[:, :, layer]] = _OCCUPIED
     picture = picture.repeat(scale, axis=0).repeat(scale, axis=1)  # [x, y, 3]
 
-    present = np.asarray(map_state.occupied)
+    present = np.asarray(map_state.present)
     centers = np.asarray(map_state.center)[:, present]
     colors = np.asarray(map_state.mean)[:, present].T
     below = centers[2] < height + _HEADROOM
@@ -163,7 +163,7 @@ def _nearest_rows(map_state: MapState, position: np.ndarray, max_range: float) -
     """
     offset = np.asarray(map_state.center).T - position
     distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-6)
-    rows = np.flatnonzero(np.asarray(map_state.occupied) & (distance <= max_range))
+    rows = np.flatnonzero(np.asarray(map_state.present) & (distance <= max_range))
     rows = rows[np.argsort(-distance[rows], kind="stable")]
     offset, distance = offset[rows], distance[rows]
     elevation = np.arcsin(offset[:, 2] / distance)

@@ -8,8 +8,8 @@ import jax
 import numpy as np
 
 from r3jax.mapping.occupancy import OccupancyGrid
-from r3jax.mapping.state import MapState, empty_map
-from r3jax.planning.planner import add_frame, first_grid
+from r3jax.mapping.state import MapState
+from r3jax.planning.planner import add_frame, first_grid, first_map
 from r3jax.runs.header import RunError
 from r3jax.runs.reader import Run, read_run
 from r3jax.runs.settings import config_of
@@ -96,7 +96,7 @@ def _states(
 def _first(runs: Sequence[Run]) -> tuple[MapState, OccupancyGrid]:
     """Returns the map and the grid before the first view of runs in one scene."""
     config = config_of(runs[0])
-    return empty_map(config.capacity, config.voxel_size, config.num_bins), grid_before(runs)
+    return first_map(config), grid_before(runs)
 
 
 def team_of(run: Run) -> list[Run]:

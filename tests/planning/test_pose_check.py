@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 import r3jax
 from r3jax.formats.recordings import read_recording
 from r3jax.frame import CONVENTIONS
-from r3jax.geometry.cameras import pixel_rays
 from r3jax.planning.pose_check import Reference, check_poses, contradicted, reference_of
+from tests.rooms_of_boxes import ROOM, frame_in_room, pose_at
 
 CAMERA = r3jax.Camera.from_fov(64, 48, 70.0)
 WRONG = [name for name in CONVENTIONS if name != "opencv"]
@@ -65,20 +65,8 @@ def test_a_recording_in_another_convention_is_noticed(lounge, convention, first)
     assert convention in said[0]
 
 
-ROOM = np.array([[-2.5, -2.0, 0.0], [2.5, 2.0, 2.6]])
-RAYS = np.asarray(pixel_rays(CAMERA), np.float64)
-
-
 def in_room(position, yaw: float, pitch: float) -> r3jax.Frame:
-    """What a camera measures in an empty room of boards: where its rays leave the box [deg]."""
-    yaw, pitch = np.deg2rad([yaw, pitch])
-    ahead = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
-    pose = np.asarray(r3jax.pose_along(np.asarray(position), ahead), np.float64)
-    rays = RAYS @ pose[:3, :3].T
-    with np.errstate(divide="ignore"):
-        depth = np.where(rays > 0, ROOM[1] - position, ROOM[0] - position) / rays
-    rgb = np.full((CAMERA.height, CAMERA.width, 3), 0.5, np.float32)
-    return r3jax.Frame(rgb, depth.min(axis=2).astype(np.float32), pose, CAMERA)
+    return frame_in_room(CAMERA, pose_at(position, yaw, pitch))
 
 
 def poses_of(frames: list[r3jax.Frame]) -> list[np.ndarray]:

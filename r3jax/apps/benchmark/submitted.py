@@ -27,8 +27,7 @@ from r3jax.formats.submissions import (
     write_submission,
 )
 from r3jax.geometry.cameras import Camera, angle_between
-from r3jax.mapping.state import empty_map
-from r3jax.planning.planner import add_frame, first_grid
+from r3jax.planning.planner import add_frame, first_grid, first_map
 from r3jax.planning.robot.limits import begin_at
 from r3jax.planning.robot.motion import MOTIONS
 from r3jax.runs.header import RunHeader, camera_fields
@@ -395,7 +394,7 @@ def retake(
         RunError: the folder holds something else, or cannot be written.
     """
     pose = begin_at(submission.robot, simulator.start_pose)
-    map_state = empty_map(config.capacity, config.voxel_size, config.num_bins)
+    map_state = first_map(config)
     grid = first_grid(np.asarray(simulator.bounds, np.float64), [pose], config)
     radians = metres = seconds = 0.0
     with RunWriter(path, header, overwrite=True) as recorder:

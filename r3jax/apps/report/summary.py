@@ -116,7 +116,8 @@ def summary(run: Run) -> dict[str, str]:
 def map_row_bytes(run: Run) -> int:
     """Returns the bytes of one row of the map.
 
-    A row has two words of key, the bins, count, color, m2 and resolution.
+    A row has two words of key, the bins, count, color, m2, resolution and misses.
     """
     num_words = -(-int(run.header.config.get("num_bins", 64)) // 32)
-    return 4 * (2 + num_words + 1 + 3 + 1 + 1)
+    misses = int(bool(run.header.config.get("remove_moved", False)))
+    return 4 * (2 + num_words + 1 + 3 + 1 + 1) + misses

@@ -38,8 +38,8 @@ from r3jax.exploration.taken_views import StepRow
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid, frontier_unexplored, squared_distance
-from r3jax.mapping.state import MapState, empty_map
-from r3jax.planning.planner import add_frame, tell_policy
+from r3jax.mapping.state import MapState
+from r3jax.planning.planner import add_frame, first_map, tell_policy
 from r3jax.planning.policy import Decision, LivesOutside, PlanInfo, Policy
 from r3jax.runs.reader import Run
 from r3jax.runs.writer import RunWriter
@@ -257,7 +257,7 @@ def share(
         )
         known_share = 1.0 - float(np.mean(np.asarray(grid.unexplored)))
         view = TeamView(
-            observation.seconds, observation.member, int(map_state.num_occupied), known_share
+            observation.seconds, observation.member, int(map_state.num_present), known_share
         )
         shared.append(SharedFrame(observation.frame, seconds, view))
     waiting = tuple(observation for observation in common.waiting if observation.seconds > until)
@@ -394,9 +394,7 @@ def _fly(
     """Steps until no member flies any more, and lets all meet at the end."""
     first = flying[0]
     config = first.mission.config
-    common = Common(
-        empty_map(config.capacity, config.voxel_size, config.num_bins), first.state.grid
-    )
+    common = Common(first_map(config), first.state.grid)
     views: list[TeamView] = []
     try:
         while any(me.stop is None for me in flying):

@@ -194,7 +194,7 @@ def blocks_of(map_state: MapState, budget: int = BUDGET) -> Blocks:
     """
     if budget < 1:
         raise InputError(f"budget must be at least 1 block, got {budget}")
-    rows = np.flatnonzero(np.asarray(map_state.occupied))
+    rows = np.flatnonzero(np.asarray(map_state.present))
     # All rows, used or not: another number of them would make JAX recompile.
     index = np.asarray(jnp.stack(unpack(map_state.key[0], map_state.key[1])))[:, rows]
     size = float(map_state.voxel_size)

@@ -467,7 +467,7 @@ class QueryHandler:
             return
         self._grounded = moment.step
         state = moment.map_state
-        centers = np.asarray(state.center)[:, np.asarray(state.occupied)]
+        centers = np.asarray(state.center)[:, np.asarray(state.present)]
         if not centers.size:
             return
         floor = floor_height(centers[2], float(state.voxel_size))

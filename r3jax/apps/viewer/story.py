@@ -28,8 +28,8 @@ from r3jax.exploration.taken_views import StepRow, TakenView
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
-from r3jax.mapping.state import MapState, empty_map
-from r3jax.planning.planner import Planner, add_frame
+from r3jax.mapping.state import MapState
+from r3jax.planning.planner import Planner, add_frame, first_map
 from r3jax.planning.policy import Decision, Policy
 from r3jax.runs.header import RunError
 from r3jax.runs.reader import Run
@@ -193,7 +193,7 @@ class Timeline:
         stored = _stored(run, grid)
         # Rows enough for the last state from the start on: what works on maps compiles once.
         capacity = self._config.capacity if stored is None else stored.map_state.capacity
-        state = empty_map(capacity, self._config.voxel_size, self._config.num_bins)
+        state = first_map(replace(self._config, capacity=capacity))
         self._start = self._reached = Moment(-1, state, grid)
         kept = max(2, memory // self._start.nbytes)
         self.stride = math.ceil(len(run.rows) / kept)

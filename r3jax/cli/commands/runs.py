@@ -181,7 +181,7 @@ def run_merge(options: MergeOptions) -> int:
         )
         write_data_set(read_run(out), map_state)
     views = " + ".join(describe_counts(run.rows) for run in runs)
-    console.say(f"{views}, {int(map_state.num_occupied)} voxels")
+    console.say(f"{views}, {int(map_state.num_present)} voxels")
     console.say(f"merged    {out}")
     console.next("train", out)
     return 0

@@ -117,6 +117,10 @@ def _claim_rows(table, keys, rows):
 def _combine(rows, mean, row, red, green, blue):
     """One observation joins a row's moments (`join.combine_moments`)."""
     before = rows.counts[row]
+    if before == _ZERO:  # a new row, or one whose voxel was removed: its marks are void
+        rows.resolution[row] = _ZERO
+        for word in range(rows.visited.shape[0]):
+            rows.visited[word, row] = np.uint32(0)
     after = before + _ONE
     weight = _ONE / after
     squared = _ZERO

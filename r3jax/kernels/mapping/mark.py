@@ -20,7 +20,7 @@ from r3jax.kernels.native.compiled import (
     prefetch,
 )
 
-_BLOCK = 1 << 12
+BLOCK = 1 << 12
 """Rows that a worker looks at before it takes the next."""
 
 _AHEAD = 16
@@ -51,7 +51,7 @@ def _farthest_around(depth, row, column):
 
 
 @inlined_fused
-def _project(key, first, num, frame, voxel_size, pixels, depths):
+def project(key, first, num, frame, voxel_size, pixels, depths):
     """Pixel and z-depth of each row from `first` on; -1 for rows out of the image or of range.
 
     Without a branch, so that LLVM turns the loop into vectors: most rows end here.
@@ -96,7 +96,7 @@ def _is_shown(pixel, measured, z, depth, slack, is_visible):
 
 
 @inlined
-def _is_camera(frame, camera):
+def is_camera(frame, camera):
     """Checks that the intrinsics and the pose are valid."""
     total = frame.fx + frame.fy + frame.cx + frame.cy
     for axis in range(3):
@@ -121,20 +121,20 @@ def map_mark(visited, resolution, key, voxel_size, frame, is_visible, bins, latt
         workers: threads.
     """
     camera = camera_of(frame, voxel_size)
-    if _is_camera(frame, camera):
+    if is_camera(frame, camera):
         _mark_all(visited, resolution, key, camera, frame, is_visible, bins, lattice, workers)
 
 
 @parallel_kernel
 def _mark_all(visited, resolution, key, camera, frame, is_visible, bins, lattice, workers):
     depth, voxel_size, capacity = frame.depth, camera.voxel_size, key.shape[1]
-    flat, blocks = depth.reshape(depth.size), (capacity + _BLOCK - 1) // _BLOCK
+    flat, blocks = depth.reshape(depth.size), (capacity + BLOCK - 1) // BLOCK
     for worker in prange(workers):
-        pixels, depths = np.empty(_BLOCK, np.int32), np.empty(_BLOCK, np.float32)
-        seen, shown = np.empty(_BLOCK, np.int32), np.empty(_BLOCK, np.int64)
+        pixels, depths = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.float32)
+        seen, shown = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int64)
         for block in range(worker, blocks, workers):
-            first, size = block * _BLOCK, min(_BLOCK, capacity - block * _BLOCK)
-            _project(key, first, size, frame, voxel_size, pixels, depths)
+            first, size = block * BLOCK, min(BLOCK, capacity - block * BLOCK)
+            project(key, first, size, frame, voxel_size, pixels, depths)
             # Listed without a branch: whether a row is in view is often mispredicted.
             num = 0
             for i in range(size):

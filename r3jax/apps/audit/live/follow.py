@@ -160,7 +160,8 @@ class Guide:
             self._bounds,
             self._policy,
             starts=[poses[arrival.index]],
-            config=MappingConfig(capacity=_CAPACITY),
+            # As the audit of the finished capture has it.
+            config=MappingConfig(capacity=_CAPACITY, remove_moved=False),
         )
 
     def _warnings(self, source: Source, arrival: Arrival) -> list[str]:

@@ -93,5 +93,6 @@ def nothing_known(
     cells = np.asarray(world_to_cell(grid, jnp.asarray(poses[:, :3, 3], jnp.float32)))
     reached = np.zeros(grid.log_odds.shape, dtype=bool)
     reached[tuple(cells.T)] = True
-    map_state = empty_map(config.capacity, config.voxel_size, config.num_bins)
+    size = (config.capacity, config.voxel_size, config.num_bins)
+    map_state = empty_map(*size, remove_moved=config.remove_moved)
     return Known(map_state, grid, reached, camera, config)
