@@ -35,24 +35,24 @@ def main(views: int = 8, size: int = 128) -> list[r3jax.Frame]:
     world = r3jax.open_scene("flat", camera=r3jax.Camera.from_fov(size, size))
     policy = r3jax.make_policy("r3-pano", num_candidates=40, num_frontier=12)
     config = r3jax.MappingConfig(capacity=1 << 14)  # the table grows by itself
-    begin = lambda: r3jax.start(
+    planner = r3jax.start(
         world.camera, world.bounds, policy, starts=[world.start_pose], config=config
     )
-    planner, frames, stream = begin(), [], slam(world)
+    frames, stream = [], slam(world)
     rgb, depth, poses = next(stream)
     for view, key in enumerate(jax.random.split(jax.random.key(0), views)):
         new = r3jax.Frame.from_arrays(rgb, depth, poses[view], world.camera, depth_scale=0.001)
-        to_add, frames = [new], [*frames, new]
+        frames = [*frames, new]
         if np.abs(np.stack([f.T_world_camera for f in frames]) - poses).max() > 1e-3:
             # What a voxel has seen cannot be moved: keep the key frames, and map them again.
             pairs = zip(frames, poses, strict=True)
             frames = [dataclasses.replace(f, T_world_camera=pose) for f, pose in pairs]
-            to_add, planner = frames, begin()
-        for frame in to_add:
-            planner = r3jax.observe(planner, frame)
+            planner, mapped = r3jax.rebuild(planner, frames), len(frames)
+        else:
+            planner, mapped = r3jax.observe(planner, new), 1
         goal, planner, info = r3jax.decide(planner, poses[view], key)
         m = planner.map_state
-        print(f"view {view}: {len(to_add)} frame(s) mapped, {int(m.num_occupied)} voxels", end="")
+        print(f"view {view}: {mapped} frame(s) mapped, {int(m.num_present)} voxels", end="")
         print(f" in {m.capacity} rows; {info.outcome.value}, {goal.length if goal else 0:.2f} m")
         if goal is None:
             break

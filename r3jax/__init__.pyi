@@ -29,6 +29,7 @@ from .planning.planner import (
     with_costmap,
 )
 from .planning.policy import Decision, DecisionOutcome
+from .planning.rebuild import rebuild
 from .planning.registry import make_policy, register_policy
 from .planning.robot.body import Body
 from .runs.saved_planner import load, save
@@ -110,6 +111,7 @@ __all__ = [
     "panorama",
     "pose_along",
     "read_scene",
+    "rebuild",
     "refuse",
     "register_policy",
     "render",
