@@ -62,7 +62,7 @@ REFUSED = {
     "audit runs --live --path scan.ply": "--path",
     "audit runs --folds 1": "--folds",
     "audit scan.r3d --live": "--live",
-    "audit /camera/color --live": "ros2_node.py",
+    "audit /camera/color --live": "r3jax_ros",
     "audit runs --port 9000": "--live",
     "audit runs --live --port 99999": "--port",
     "audit runs --live --depth-scale 2": "--depth-scale",

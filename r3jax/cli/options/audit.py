@@ -114,8 +114,8 @@ def _check_live(path: Path) -> None:
         return
     raise InputError(
         f"{path}: there is no such capture, and no folder in which it could be recorded. Topics of "
-        "a running ROS 2 are followed by the node, which shows the same page: python "
-        f"examples/ros2_node.py --ros-args -p page_port:=8080 -r color:={path} -r depth:=... -r "
+        "a running ROS 2 are followed by the node, which shows the same page: ros2 run "
+        f"r3jax_ros explorer --ros-args -p page_port:=8080 -r color:={path} -r depth:=... -r "
         "camera_info:=...; or follow a bag: ros2 bag record -o drive --storage mcap TOPICS, and "
         "r3jax audit drive --live"
     )

@@ -7,6 +7,7 @@ rclpy does, a message refuses fields that it does not have and numbers of anothe
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -17,12 +18,14 @@ from scipy.spatial.transform import Rotation
 from r3jax.formats.ros.transforms import TransformTree
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
+PACKAGE = Path(__file__).resolve().parents[2] / "ros" / "r3jax_ros"
 _BASE, _NAME = 1, 2
 _PLAIN = {"string": str, "bool": bool, "float32": float, "float64": float}
 
 MESSAGES = {
     "geometry_msgs": ("Point", "Pose", "PoseStamped", "TransformStamped"),
-    "nav_msgs": ("Path",),
+    "action_msgs": ("GoalStatus",),
+    "nav_msgs": ("OccupancyGrid", "Path"),
     "sensor_msgs": ("CameraInfo", "Image", "PointCloud2", "PointField"),
     "std_msgs": ("ColorRGBA", "Header"),
     "visualization_msgs": ("Marker", "MarkerArray"),
@@ -95,6 +98,7 @@ class Node:
         self.callbacks: dict[str, Any] = {}
         self.published: dict[str, Publisher] = {}
         self.said: list[str] = []
+        self.services: dict[str, Any] = {}
 
     def declare_parameter(self, name: str, default: Any) -> Any:
         return SimpleNamespace(value=self.parameters.get(name, default))
@@ -106,6 +110,16 @@ class Node:
         self.published[topic] = Publisher(kind, topic)
         return self.published[topic]
 
+    def create_service(self, kind, name, callback, callback_group=None):
+        self.services[name] = callback
+
+    def ask(self, name: str) -> Any:
+        """Calls a service."""
+        answer = self.services[name](Trigger.Request(), Trigger.Response())
+        assert isinstance(answer.success, bool)
+        assert isinstance(answer.message, str)
+        return answer
+
     def create_timer(self, seconds, callback, callback_group=None):
         self.callbacks["timer"] = callback
 
@@ -116,6 +130,86 @@ class Node:
     def get_clock(self):
         now = message_class("builtin_interfaces/msg/Time")
         return SimpleNamespace(now=lambda: SimpleNamespace(to_msg=now))
+
+
+class Trigger:
+    """std_srvs/srv/Trigger."""
+
+    Request = SimpleNamespace
+
+    class Response(SimpleNamespace):
+        success, message = False, ""
+
+
+class NavigateToPose:
+    """nav2_msgs/action/NavigateToPose: the fields that the node uses."""
+
+    class Goal:
+        def __init__(self, *, pose: Message):
+            assert pose.kind == "geometry_msgs/msg/PoseStamped"
+            self.pose = pose
+
+
+class Done:
+    """A future whose result the test sets."""
+
+    def __init__(self):
+        self.callbacks: list[Any] = []
+        self.value: Any = None
+
+    def add_done_callback(self, callback: Any) -> None:
+        self.callbacks.append(callback)
+
+    def result(self) -> Any:
+        return self.value
+
+    def set(self, value: Any) -> None:
+        self.value = value
+        for callback in self.callbacks:
+            callback(self)
+
+
+class ActionClient:
+    """Nav2's side of its action, played by the test."""
+
+    is_ready = True
+
+    def __init__(self, node: Node, kind: type, name: str, callback_group: Any = None):
+        assert kind is NavigateToPose
+        self.sent: list[Sent] = []
+        node.nav2 = self
+
+    def server_is_ready(self) -> bool:
+        return self.is_ready
+
+    def send_goal_async(self, goal: NavigateToPose.Goal, feedback_callback: Any) -> Done:
+        self.sent.append(Sent(goal, feedback_callback))
+        return self.sent[-1].answer
+
+
+class Sent:
+    """A goal that Nav2 was sent."""
+
+    def __init__(self, goal: NavigateToPose.Goal, feedback: Any):
+        self.pose, self.feedback = goal.pose, feedback
+        self.answer, self.result, self.is_canceled = Done(), Done(), False
+
+    def accept(self, accepted: bool = True) -> None:
+        def cancel() -> None:
+            self.is_canceled = True
+
+        self.answer.set(
+            SimpleNamespace(
+                accepted=accepted, cancel_goal_async=cancel, get_result_async=lambda: self.result
+            )
+        )
+
+    def drive(self, remaining: float) -> None:
+        told = SimpleNamespace(distance_remaining=remaining, number_of_recoveries=1)
+        self.feedback(SimpleNamespace(feedback=told))
+
+    def end(self, status: int) -> None:
+        self.result.set(SimpleNamespace(status=status))
 
 
 class TransformException(Exception):
@@ -185,6 +279,11 @@ def modules() -> dict[str, ModuleType]:
     """All modules that a node imports, by their names."""
     anything = lambda *args, **options: SimpleNamespace()
     contents: dict[str, dict[str, Any]] = {
+        "nav2_msgs": {},
+        "nav2_msgs.action": {"NavigateToPose": NavigateToPose},
+        "rclpy.action": {"ActionClient": ActionClient},
+        "std_srvs": {},
+        "std_srvs.srv": {"Trigger": Trigger},
         "rclpy": {"init": anything, "try_shutdown": anything},
         "rclpy.callback_groups": {"MutuallyExclusiveCallbackGroup": anything},
         "rclpy.executors": {"MultiThreadedExecutor": anything},
@@ -220,10 +319,14 @@ def ros2(**parameters: Any) -> Iterator[None]:
     """Puts the modules where an import finds them, and gives nodes their parameters."""
     before = {name: sys.modules.get(name) for name in modules()}
     sys.modules.update(modules())
-    Node.parameters = parameters
+    Node.parameters, ActionClient.is_ready = parameters, True
+    sys.path.insert(0, str(PACKAGE))
     try:
         yield
     finally:
+        sys.path.remove(str(PACKAGE))
+        for name in [name for name in sys.modules if name.partition(".")[0] == PACKAGE.name]:
+            del sys.modules[name]
         for name, module in before.items():
             if module is None:
                 del sys.modules[name]

@@ -1,0 +1,1 @@
+"""r3jax as a ROS 2 node."""

@@ -1,0 +1,365 @@
+"""The node: color, depth, camera_info, tf and a costmap in; goals of Nav2, markers and a cloud out.
+
+Images are noted as they come and mapped by a timer in a thread of its own, so that tf goes on
+meanwhile. `path` (nav_msgs/Path) is the trajectory as a SLAM system has optimized it: when a loop
+closure moves it, the key frames move along and are mapped again in another thread, while the robot
+waits. See docs/howto/robot.md.
+"""
+
+import contextlib
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+
+import jax
+import message_filters
+import numpy as np
+import rclpy
+import tf2_ros
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import OccupancyGrid, Path
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.executors import MultiThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from rclpy.time import Time
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
+
+import r3jax
+from r3jax.apps.audit.live.guide_page import open_guide
+from r3jax.formats.depth import resample_depth
+from r3jax.formats.points import voxel_points
+from r3jax.formats.ros.messages import depth_of, frame_of, lens_of, rgb_of, stamp_of
+from r3jax.planning.growth import GrowthAhead
+from r3jax.planning.robot.motion import make_motion
+from r3jax_ros.messages import Costmap, cloud_of, markers_of, matrix_of, pose_of
+from r3jax_ros.navigation import Navigator
+from r3jax_ros.settings import declared
+from r3jax_ros.trajectory import KeyFrame, base_for_view, corrected, has_moved, track_of
+
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+"""Reliable, and a late subscriber gets the last message, too."""
+
+MOVED = 0.02
+"""A loop closure that moves no key frame by more [m, and entries of the rotation] is ignored."""
+
+
+class ExplorerNode(Node):
+    """Maps key frames, and sends the robot to the next view whenever it has arrived."""
+
+    def __init__(self):
+        super().__init__("r3jax")
+        self.settings = settings = declared(self)
+        self.bounds = np.reshape(settings.bounds, (2, 3))
+        self.running, self.costmap, self.growth = settings.autostart, None, GrowthAhead()
+        self.pages, self.mapper = contextlib.ExitStack(), ThreadPoolExecutor(1)
+        self.pending, self.frames, self.track = deque(maxlen=10), [], None
+        self.info, self.planner, self.goal, self.decisions = None, None, None, 0
+        self.has_news, self.last_stamp, self.goal_stamp, self.chosen = False, 0, 0, None
+        self.rebuilding: tuple[Future, int] | None = None
+
+        self.page = None
+        if settings.page_port:  # the page of `r3jax audit --live`, for this robot
+            guide = open_guide(settings.page_host, settings.page_port)
+            self.page = self.pages.enter_context(guide)
+            self.get_logger().info(f"where it goes next: {self.page.url}")
+
+        # Two groups: what maps and decides must not keep the images, nor tf, from coming in.
+        incoming, self.working = MutuallyExclusiveCallbackGroup(), MutuallyExclusiveCallbackGroup()
+        sensor = {"qos_profile": qos_profile_sensor_data, "callback_group": incoming}
+        images = [message_filters.Subscriber(self, Image, name, **sensor) for name in
+                  ("color", "depth")]  # fmt: skip
+        self.pairs = message_filters.ApproximateTimeSynchronizer(images, 10, 0.02)
+        self.pairs.registerCallback(self.on_images)
+        self.create_subscription(CameraInfo, "camera_info", self.on_info, **sensor)
+        self.create_subscription(Path, "path", self.on_path, 1, callback_group=self.working)
+        self.create_subscription(
+            OccupancyGrid, "costmap", self.on_costmap, LATCHED, callback_group=self.working
+        )
+        self.tf = tf2_ros.Buffer()
+        self.listener = tf2_ros.TransformListener(self.tf, self)
+        self.navigator = Navigator(self, settings.navigate_action, self.working)
+        self.goals = self.create_publisher(PoseStamped, "next_goal", LATCHED)
+        self.markers = self.create_publisher(MarkerArray, "next_view", LATCHED)
+        self.clouds = self.create_publisher(PointCloud2, "map_points", LATCHED)
+        for name in ("start", "stop", "save", "load"):
+            answer = getattr(self, f"on_{name}")
+            self.create_service(Trigger, f"~/{name}", answer, callback_group=self.working)
+        self.create_timer(0.1, self.work, callback_group=self.working)
+
+    # ------------------------------------------------------------------------------- messages
+
+    def on_info(self, message) -> None:
+        """Notes the camera."""
+        self.info = message
+
+    def on_costmap(self, message) -> None:
+        """Notes where Nav2 says that the robot cannot stand."""
+        if message.header.frame_id != self.settings.world_frame:
+            self.get_logger().warning(
+                f"the costmap is in {message.header.frame_id!r}, not in world_frame "
+                f"{self.settings.world_frame!r}: ignored",
+                throttle_duration_sec=10.0,
+            )
+            return
+        self.costmap = Costmap(message)
+
+    def on_images(self, color, depth) -> None:
+        """Notes a pair if it is time for another key frame; it is mapped by `work`."""
+        stamp = stamp_of(color)
+        if (stamp - self.last_stamp) * 1e-9 * self.settings.frame_rate >= 1.0:
+            self.last_stamp = stamp
+            self.pending.append((color, depth))
+
+    def on_path(self, path) -> None:
+        """Moves the key frames with the trajectory, and maps them again if they moved."""
+        if self.rebuilding is not None:
+            return  # the next path tells of what this one does
+        before, self.track = self.track, track_of(path)
+        if before is None or not self.frames:
+            return
+        moved = corrected(self.frames, before, self.track)
+        off = [np.abs(a.T_world_camera - b.T_world_camera).max() for a, b in
+               zip(moved, self.frames, strict=True)]  # fmt: skip
+        if max(off) <= MOVED:
+            self.track = before  # small steps add up
+            return
+        self.get_logger().info(f"loop closed: mapping {len(moved)} key frames again")
+        self.navigator.cancel()
+        self.frames, self.goal = moved, None
+        if self.page is not None:
+            self.page.forget()
+        task = self.mapper.submit(r3jax.rebuild, self.planner, map(self.to_frame, moved))
+        self.rebuilding = task, len(moved)
+
+    # ------------------------------------------------------------------------------- services
+
+    def on_start(self, request, response):
+        """Begins to explore, or goes on."""
+        self.running, self.has_news = True, bool(self.frames)
+        response.success, response.message = True, "exploring"
+        return response
+
+    def on_stop(self, request, response):
+        """Stops the robot; images are mapped all the while."""
+        self.running, self.goal = False, None
+        self.navigator.cancel()
+        response.success, response.message = True, "stopped; images are still mapped"
+        return response
+
+    def on_save(self, request, response):
+        """Writes the planner to `map_file`."""
+        if self.planner is None:
+            response.success, response.message = False, "nothing is mapped yet"
+            return response
+        return self._tried(response, "saved", lambda: r3jax.save(self.planner, self.map_file))
+
+    def on_load(self, request, response):
+        """Takes the planner of `map_file` in place of the present one."""
+
+        def load() -> None:
+            self.planner, self.rebuilding = r3jax.load(self.map_file), None
+            # Its key frames are not in the file: a closure moves what comes from now on.
+            self.frames, self.goal, self.track = [], None, None
+            self.navigator.cancel()
+
+        return self._tried(response, "loaded", load)
+
+    @property
+    def map_file(self) -> str:
+        """Where the planner is kept."""
+        return self.settings.map_file
+
+    def _tried(self, response, done: str, task):
+        try:
+            task()
+            response.success, response.message = True, f"{done} {self.map_file}"
+        except Exception as error:  # a service answers, whatever went wrong
+            response.success, response.message = False, f"{type(error).__name__}: {error}"
+            self.get_logger().warning(response.message)
+        return response
+
+    # ------------------------------------------------------------------------------- the work
+
+    def work(self) -> None:
+        """Maps what has come in, and decides where the robot has arrived. In one thread only."""
+        for _ in range(len(self.pending)):
+            color, depth = self.pending.popleft()
+            frame = self.key_frame(color, depth)
+            if frame is None:
+                self.pending.append((color, depth))  # its transforms may be still to come
+            elif not self.frames or has_moved(self.frames[-1].T_world_camera, frame.T_world_camera):
+                self.add(frame)
+        if self.rebuilding is not None and self.rebuilding[0].done():
+            self.swap()
+        if self.running and self.rebuilding is None and self.has_news and self.is_due():
+            self.decide()
+
+    def key_frame(self, color, depth) -> KeyFrame | None:
+        """A key frame; None where the camera or its pose is not known."""
+        if self.info is None:
+            return None
+        settings = self.settings
+        try:
+            stamp = Time.from_msg(color.header.stamp)
+            T = self.look_up(settings.world_frame, frame_of(color), stamp)
+            self.T_base_camera = self.look_up(settings.base_frame, frame_of(color), Time())
+        except tf2_ros.TransformException as error:
+            self.get_logger().warning(str(error), throttle_duration_sec=5.0)
+            return None
+        lens, every = lens_of(self.info), slice(None, None, settings.stride)
+        z = resample_depth(depth_of(depth), lens)
+        rgb, z = rgb_of(color)[every, every].copy(), z[every, every].copy()  # not the whole images
+        return KeyFrame(stamp_of(color), rgb, z, T)
+
+    def look_up(self, parent: str, child: str, time) -> np.ndarray:
+        """`T_parent_child` [4, 4] of tf, composed along its chain: map, odom, base, camera."""
+        move = self.tf.lookup_transform(parent, child, time).transform
+        return matrix_of(move.translation, move.rotation)
+
+    def to_frame(self, key_frame: KeyFrame) -> r3jax.Frame:
+        """The frame of every `stride`-th pixel."""
+        stride, (fx, fy, cx, cy) = self.settings.stride, lens_of(self.info).intrinsics
+        height, width = key_frame.depth.shape
+        center = [(c - 0.5) / stride + 0.5 for c in (cx, cy)]
+        camera = r3jax.Camera(width, height, fx / stride, fy / stride, *center)
+        return r3jax.Frame.from_arrays(
+            key_frame.rgb, key_frame.depth, key_frame.T_world_camera, camera
+        )
+
+    def add(self, key_frame: KeyFrame) -> None:
+        """Adds a key frame to the map; to a map that is being rebuilt, when it is ready."""
+        self.frames.append(key_frame)
+        if self.rebuilding is None:
+            self.observe(key_frame)
+
+    def observe(self, key_frame: KeyFrame) -> None:
+        """Maps a key frame."""
+        frame = self.to_frame(key_frame)
+        if self.planner is None:
+            self.begin(frame.camera, key_frame.T_world_camera)
+        self.planner = r3jax.observe(self.planner, frame)
+        self.growth.look(self.planner, frame)  # compiles for a larger map before it is one
+        self.has_news = True
+        if self.page is not None:
+            self.page.observed(self.planner, frame)
+
+    def swap(self) -> None:
+        """Takes the rebuilt planner, and maps what has come in meanwhile."""
+        (task, num), self.rebuilding = self.rebuilding, None
+        self.planner, self.has_news = task.result(), True
+        if self.page is not None:
+            for key_frame in self.frames[:num]:
+                self.page.passed(self.to_frame(key_frame))
+        for key_frame in self.frames[num:]:
+            self.observe(key_frame)
+
+    def begin(self, camera: r3jax.Camera, T_world_camera: np.ndarray) -> None:
+        """Starts an empty map; a robot on wheels keeps its camera's height and tilt."""
+        settings, motion = self.settings, make_motion(self.settings.motion)
+        if settings.motion == "ground":
+            tilt = float(np.degrees(np.arcsin(np.clip(T_world_camera[2, 2], -1.0, 1.0))))
+            motion = replace(motion, elevations=(tilt, tilt), body=self.body())
+        few = {"num_candidates": settings.candidates,
+               "num_frontier": settings.candidates * 3 // 10}  # fmt: skip
+        policy = r3jax.make_policy(settings.policy, motion=motion, **few)
+        config = r3jax.MappingConfig(
+            max_range=settings.max_range,
+            capacity=settings.map_rows,
+            remove_moved=settings.remove_moved,
+        )
+        starts = [T_world_camera]
+        self.planner = r3jax.start(camera, self.bounds, policy, starts=starts, config=config)
+
+    def body(self):
+        """Describes the robot round its camera, which r3jax plans for."""
+        settings, at = self.settings, self.T_base_camera[:2, 3]
+        if not hasattr(r3jax, "Body"):  # an earlier r3jax knows how far it reaches down
+            return max(0.0, float(self.T_base_camera[2, 3]) - 0.1)
+        if len(settings.footprint) == 1:
+            # The disk round the camera that holds the disk round the base.
+            footprint = settings.footprint[0] + float(np.hypot(*at))
+        else:
+            yaw = np.arctan2(*self.T_base_camera[1::-1, 2])
+            turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+            corners = (np.reshape(settings.footprint, (-1, 2)) - at) @ turn
+            footprint = tuple((float(x), float(y)) for x, y in corners)
+        heights = (0.0, settings.height or None)
+        floor = float(self.bounds[0, 2])
+        return r3jax.Body(footprint, heights, margin=settings.margin, floor=floor)
+
+    def is_due(self) -> bool:
+        """True without a goal, at the goal, where Nav2 gave it up, and after `patience`."""
+        if self.goal is None or not self.navigator.is_busy:
+            return True
+        here = self.frames[-1]
+        away = np.linalg.norm(here.T_world_camera[:3, 3] - self.goal[:3, 3])
+        is_late = (here.stamp - self.goal_stamp) * 1e-9 > self.settings.patience
+        return bool(away < self.settings.arrived or is_late)
+
+    def decide(self) -> None:
+        """Sends the robot to the next view."""
+        here, key = self.frames[-1], jax.random.fold_in(jax.random.key(0), self.decisions)
+        self.has_news, self.decisions = False, self.decisions + 1
+        if (
+            self.chosen is not None
+            and self.navigator.state == "failed"
+            and hasattr(r3jax, "refuse")
+        ):
+            self.planner = r3jax.refuse(self.planner, self.chosen)
+        decision, self.planner, info = r3jax.decide(self.planner, here.T_world_camera, key)
+        header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self.settings.world_frame)
+        self.clouds.publish(cloud_of(header, *voxel_points(self.planner.map_state)))
+        if self.page is not None:
+            self.page.decided(self.to_frame(here), decision)
+        if decision is None:
+            self.navigator.cancel()
+            self.goal = None
+            self.get_logger().warning(f"no next view: {info.outcome.value}")
+            return
+        view = self.best_open_view(decision)
+        if view is None:
+            self.get_logger().warning("the costmap closes every candidate: no goal")
+            return
+        self.goal, self.goal_stamp = view, here.stamp
+        self.chosen = replace(decision, T_world_camera=view)
+        pose = PoseStamped(header=header, pose=pose_of(self.base_of(view)))
+        self.goals.publish(pose)
+        self.markers.publish(markers_of(header, decision))
+        self.navigator.go(pose)
+
+    def base_of(self, T_world_camera: np.ndarray) -> np.ndarray:
+        """Where the base stands when the camera has a view."""
+        if self.settings.motion == "ground":
+            return base_for_view(T_world_camera, self.T_base_camera)
+        return T_world_camera @ np.linalg.inv(self.T_base_camera)
+
+    def best_open_view(self, decision: r3jax.Decision) -> np.ndarray | None:
+        """The decision's view, or the best candidate whose place the costmap leaves open."""
+        if self.costmap is None:
+            return decision.T_world_camera
+        order = np.argsort(-np.nan_to_num(decision.utilities["total"], nan=-np.inf))
+        views = [decision.T_world_camera, *decision.candidates[order]]
+        places = np.stack([self.base_of(T)[:3, 3] for T in views])
+        is_open = self.costmap.at(places) < self.settings.occupied_cost
+        return views[int(np.argmax(is_open))] if is_open.any() else None
+
+
+def spin() -> None:
+    """Spins: one thread for images and tf, one for the map, one to spare."""
+    rclpy.init()
+    node, executor = ExplorerNode(), MultiThreadedExecutor(num_threads=3)
+    executor.add_node(node)
+    try:
+        executor.spin()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        node.navigator.cancel()
+        node.mapper.shutdown(wait=False, cancel_futures=True)
+        node.pages.close()
+        node.destroy_node()
+        rclpy.try_shutdown()
