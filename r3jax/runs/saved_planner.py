@@ -134,7 +134,9 @@ def _planner_of(
 ) -> Planner:
     arrays = dict(tables["map"])
     num_bins = int(arrays.pop("num_bins"))
-    map_state = fill(empty_map(2, config.voxel_size, num_bins), arrays)
+    map_state = fill(
+        empty_map(2, config.voxel_size, num_bins, remove_moved="misses" in arrays), arrays
+    )
     # Like a grid of one cell; which of its optional arrays there are, the file says.
     small = empty_grid(np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]), config.cell_size)
     optional = {"worth_a_look": bool, "marks": np.uint8}

@@ -4,6 +4,7 @@ import importlib
 from collections.abc import Iterator
 from concurrent.futures import wait
 
+import jax
 import numpy as np
 import pytest
 import yaml
@@ -28,8 +29,14 @@ REMAPPED = {COLOR: "color", DEPTH: "depth", "/camera/color/camera_info": "camera
 
 
 @pytest.fixture
-def module():
-    settings = {"bounds": list(BOUNDS), "motion": "free", "stride": 1, "candidates": 20}
+def module(tmp_path):
+    settings = {
+        "map_file": str(tmp_path / "map"),
+        "bounds": list(BOUNDS),
+        "motion": "free",
+        "stride": 1,
+        "candidates": 20,
+    }
     with stubs.ros2(**settings, patience=0.1):
         yield importlib.import_module("r3jax_ros.node")
 
@@ -104,6 +111,20 @@ def test_a_bag_goes_in_and_goals_come_out(module, tmp_path):
     assert to_wall.max() < 0.3
 
     closed_loop(module, node)
+    saved_and_loaded(node)
+
+
+def saved_and_loaded(node):
+    """The services write the planner and read it back."""
+    before, place = voxels(node), node.frames[-1].T_world_camera
+    for name in ("save", "load"):
+        answer = node.ask(f"~/{name}")
+        assert answer.success, answer.message
+    np.testing.assert_array_equal(voxels(node), before)
+    assert not node.frames
+    node.callbacks["timer"]()  # nothing to decide on yet
+    decision, _, _ = r3jax.decide(node.planner, place, jax.random.key(0))
+    assert decision is not None
 
 
 def voxels(node) -> np.ndarray:

@@ -37,14 +37,16 @@ class Costmap:
         info = message.info
         self.frame = message.header.frame_id
         self.cost = np.reshape(np.asarray(message.data, np.int16), (info.height, info.width))
-        self._T_map_world = np.linalg.inv(matrix_of(info.origin.position, info.origin.orientation))
-        self._resolution = float(info.resolution)
+        T_world_map = matrix_of(info.origin.position, info.origin.orientation)
+        self.origin, self.resolution = T_world_map[:2, 3], float(info.resolution)
+        self.is_aligned = bool(np.allclose(T_world_map[:3, :3], np.eye(3), atol=1e-6))
+        self._T_map_world = np.linalg.inv(T_world_map)
 
     def at(self, points: np.ndarray) -> np.ndarray:
         """Cost at points [n, 2 or 3] [m], 0 to 100; -1 where it is unknown or beyond the map."""
         flat = np.concatenate([points[:, :2], np.zeros((len(points), 1))], axis=1)
         local = flat @ self._T_map_world[:3, :3].T + self._T_map_world[:3, 3]
-        column, row = np.floor(local[:, :2] / self._resolution).astype(int).T
+        column, row = np.floor(local[:, :2] / self.resolution).astype(int).T
         height, width = self.cost.shape
         is_in = (row >= 0) & (row < height) & (column >= 0) & (column < width)
         found = self.cost[np.where(is_in, row, 0), np.where(is_in, column, 0)]

@@ -163,7 +163,8 @@ class ExplorerNode(Node):
         def load() -> None:
             self.planner, self.rebuilding = r3jax.load(self.map_file), None
             # Its key frames are not in the file: a closure moves what comes from now on.
-            self.frames, self.goal, self.track = [], None, None
+            self.frames, self.goal, self.track, self.has_news = [], None, None, False
+            self.chosen = None
             self.navigator.cancel()
 
         return self._tried(response, "loaded", load)
@@ -274,11 +275,9 @@ class ExplorerNode(Node):
         starts = [T_world_camera]
         self.planner = r3jax.start(camera, self.bounds, policy, starts=starts, config=config)
 
-    def body(self):
+    def body(self) -> r3jax.Body:
         """Describes the robot round its camera, which r3jax plans for."""
         settings, at = self.settings, self.T_base_camera[:2, 3]
-        if not hasattr(r3jax, "Body"):  # an earlier r3jax knows how far it reaches down
-            return max(0.0, float(self.T_base_camera[2, 3]) - 0.1)
         if len(settings.footprint) == 1:
             # The disk round the camera that holds the disk round the base.
             footprint = settings.footprint[0] + float(np.hypot(*at))
@@ -310,6 +309,9 @@ class ExplorerNode(Node):
             and hasattr(r3jax, "refuse")
         ):
             self.planner = r3jax.refuse(self.planner, self.chosen)
+        if self.costmap is not None and self.costmap.is_aligned:
+            layer = self.costmap.cost, self.costmap.resolution, self.costmap.origin
+            self.planner = r3jax.with_costmap(self.planner, *layer)
         decision, self.planner, info = r3jax.decide(self.planner, here.T_world_camera, key)
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self.settings.world_frame)
         self.clouds.publish(cloud_of(header, *voxel_points(self.planner.map_state)))
