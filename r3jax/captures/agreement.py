@@ -59,7 +59,7 @@ class DepthImage:
     """`T_world_camera`, [4, 4] float64, in the unit of the depth."""
 
     def points(self, most: int, rng: np.random.Generator) -> np.ndarray:
-        """Returns some of the points that it shows, in the camera's frame, [n, 3]."""
+        """Draws some of the points that the depth image shows, in the camera's frame, [n, 3]."""
         return _points(self.depth, _lens_of(self.camera), most, rng)
 
 
@@ -95,7 +95,7 @@ def _points(depth: np.ndarray, lens: np.ndarray, most: int, rng: np.random.Gener
 
 
 def _coarser(images: Sequence[DepthImage]) -> list[_Image]:
-    """Returns some of the images, with fewer pixels."""
+    """Selects some of the images, and reduces their resolution."""
     out: list[_Image] = []
     for image in (images[i] for i in evenly_spaced(len(images), _PICTURES)):
         stride = max(1, -(-max(image.depth.shape) // _SIDE))
@@ -188,7 +188,7 @@ def _never_small(size: np.ndarray) -> bool:
 
 
 def _either_or(undo: _Undo, fits: str, todo: str) -> Mistake:
-    """Returns a mistake that has no size."""
+    """Makes a mistake that has no size."""
     return Mistake(undo, np.zeros((1, 1)), (), _never_small, fits, todo)
 
 

@@ -34,22 +34,22 @@ class Alignment:
     """Where the audit's origin lies in the capture, [3] float64."""
 
     def points(self, points_capture: np.ndarray) -> np.ndarray:
-        """Returns points [n, 3] of the capture, in the audit."""
+        """Transforms points [n, 3] of the capture into the audit."""
         return self.scale * (points_capture - self.origin) @ self.rotation.T
 
     def points_back(self, points_audit: np.ndarray) -> np.ndarray:
-        """Returns points [n, 3] of the audit, in the capture: inverse of `points`."""
+        """Transforms points [n, 3] of the audit into the capture: the inverse of `points`."""
         return points_audit.astype(np.float64) @ self.rotation / self.scale + self.origin
 
     def poses(self, poses_capture: np.ndarray) -> np.ndarray:
-        """Returns `T_world_camera` [n, 4, 4] of the capture, in the audit; they stay rigid."""
+        """Transforms `T_world_camera` [n, 4, 4] of the capture into the audit; they stay rigid."""
         moved = poses_capture.astype(np.float64)
         moved[:, :3, :3] = self.rotation @ moved[:, :3, :3]
         moved[:, :3, 3] = self.points(moved[:, :3, 3])
         return moved
 
     def poses_back(self, poses_audit: np.ndarray) -> np.ndarray:
-        """Returns `T_world_camera` [n, 4, 4] of the audit, in the capture: inverse of `poses`."""
+        """Transforms `T_world_camera` [n, 4, 4] back into the capture: the inverse of `poses`."""
         moved = poses_audit.astype(np.float64)
         moved[:, :3, :3] = self.rotation.T @ moved[:, :3, :3]
         moved[:, :3, 3] = self.points_back(moved[:, :3, 3])
@@ -62,7 +62,7 @@ def evenly_spaced(count: int, most: int) -> np.ndarray:
 
 
 def up_of(name: str) -> np.ndarray:
-    """Returns the unit vector [3] of an axis' name, such as `y` or `-z`, or of three numbers.
+    """Parses a direction: an axis' name, such as `y` or `-z`, or three numbers; a unit vector [3].
 
     Raises:
         ValueError: neither of them.
@@ -84,9 +84,9 @@ def up_of(name: str) -> np.ndarray:
 
 
 def rotation_to_z(up: np.ndarray) -> np.ndarray:
-    """Returns the smallest rotation [3, 3] that takes a unit vector [3] to z.
+    """Computes the smallest rotation [3, 3] that takes a unit vector [3] to z.
 
-    From -z, half a turn about x.
+    From -z it is half a turn about x.
 
     Rodrigues: with v = up x z and c = <up, z>, R = I + [v] + [v]^2 / (1 + c).
     """

@@ -50,10 +50,7 @@ class CameraPath:
 
 
 def is_camera_path(path: Path) -> bool:
-    """Returns True for a JSON file with a `camera_path`.
-
-    False for whatever cannot be read as one.
-    """
+    """Returns True for a readable JSON file with a `camera_path`, False for any other file."""
     if path.suffix != ".json" or not path.is_file():
         return False
     try:
@@ -102,7 +99,7 @@ def _matrix(index: int, entry: dict[str, Any]) -> np.ndarray:
 
 
 def _lens(index: int, entry: dict[str, Any], size: tuple[int, int]) -> Lens:
-    """Returns `fov` is the vertical angle of view [deg].
+    """Makes the lens of a keyframe, whose `fov` is the vertical angle of view [deg].
 
     `aspect` makes no difference to square pixels.
     """

@@ -66,7 +66,7 @@ class Seen:
     """Fold of each image used, in the order of `Survey.chosen`."""
 
     def without(self, fold: int) -> MapState:
-        """Returns the map of all images but those of a fold."""
+        """Merges the maps of all folds but one."""
         return united([part for i, part in enumerate(self.folds) if i != fold])
 
 
@@ -151,7 +151,7 @@ def integrate_rays(grid: OccupancyGrid, eye: np.ndarray, points: np.ndarray) -> 
     origin = np.asarray(grid.origin, np.float64)
 
     def inside(positions: np.ndarray) -> np.ndarray:
-        """Returns the flat indices of the cells that hold positions, those outside left out."""
+        """Returns the flat indices of the cells that hold positions, leaving out those outside."""
         index = np.floor((positions - origin) / cell).astype(np.int64)
         index = index[np.all((index >= 0) & (index < shape), axis=1)]
         return (index[:, 0] * shape[1] + index[:, 1]) * shape[2] + index[:, 2]
@@ -200,7 +200,7 @@ _integrate_pixels = jax.jit(integrate_pixels)
 
 
 def _grown(state: MapState, frame: Frame, drop_edges: bool) -> MapState:
-    """Returns the frame's pixels join; the table grows."""
+    """Adds the frame's pixels to the map, which grows as needed."""
     arguments = frame, jnp.float32(RANGE), jnp.asarray(drop_edges)
     try:
         return update_growing(lambda now: _integrate_pixels(now, *arguments), state, _MOST_ROWS)
@@ -211,7 +211,7 @@ def _grown(state: MapState, frame: Frame, drop_edges: bool) -> MapState:
 
 
 def _reach(source: Source, frame: Frame) -> Float[Array, ""]:
-    """Returns how far an image looks [audit units]."""
+    """Returns the distance up to which an image shows surfaces [audit units]."""
     if source.is_dense:
         return jnp.float32(RANGE)
     farthest = float(jnp.max(frame.depth))
@@ -219,7 +219,7 @@ def _reach(source: Source, frame: Frame) -> Float[Array, ""]:
 
 
 def _blank(state: MapState) -> MapState:
-    """Returns the same rows, of which nothing has been seen."""
+    """Returns a map with the same rows, without observations."""
     empty = jax.tree.map(jnp.zeros_like, state)
     kept = lambda m: (m.key, m.voxel_size)
     return eqx.tree_at(kept, empty, kept(state))
@@ -240,7 +240,7 @@ def _join_fold(
 
 
 def united(parts: Sequence[MapState]) -> MapState:
-    """Returns the union of maps with the same rows: what `merge` gives, row by row."""
+    """Merges maps with the same rows, row by row; the result is that of `merge`."""
     total = parts[0]
     for part in parts[1:]:
         total = _unite(total, part)

@@ -50,17 +50,14 @@ class SamplingTable(NamedTuple):
     """False where the image has no such pixel, [h, w]."""
 
     def take(self, image: np.ndarray) -> np.ndarray:
-        """Returns the thinned image [h, w, ...] of an image [H, W, ...].
-
-        0 where there is no pixel.
-        """
+        """Thins an image [H, W, ...] to [h, w, ...]; samples outside of it are 0."""
         taken = image[self.row, self.column]
         taken[~self.is_there] = 0
         return taken
 
 
 def thinned(camera: Camera, stride: int) -> Camera:
-    """Returns the pinhole of every `stride`-th pixel, from the middle of the first block on."""
+    """Returns the pinhole of every `stride`-th pixel, starting in the middle of the first block."""
     sides = (camera.width, camera.height)
     width, height = (len(taken(side, stride)) for side in sides)
     cx, cy = (
@@ -71,12 +68,12 @@ def thinned(camera: Camera, stride: int) -> Camera:
 
 
 def taken(side: int, stride: int) -> np.ndarray:
-    """Returns which of `side` pixels in a row are taken; at least one."""
+    """Returns the indices of the pixels taken from `side` pixels in a row; at least one."""
     return np.arange(min(stride // 2, side - 1), side, stride)
 
 
 def ray_lengths(shape: tuple[int, ...], lens: np.ndarray) -> np.ndarray:
-    """Returns lengths of the pixels' rays (x, y, 1), [h, w]: depth along the ray over z.
+    """Computes the lengths of the pixels' rays (x, y, 1), [h, w]: depth along the ray over z.
 
     Args:
         shape: h, w.
@@ -89,7 +86,7 @@ def ray_lengths(shape: tuple[int, ...], lens: np.ndarray) -> np.ndarray:
 
 @functools.lru_cache(maxsize=8)
 def sampling_table(lens: Lens, stride: int) -> SamplingTable:
-    """Returns where the pixels of `thinned(lens.camera, stride)` lie in the lens's own image.
+    """Computes the position of each pixel of `thinned(lens.camera, stride)` in the lens's image.
 
     Raises:
         ForeignFileError: a lens whose distortion is not known here.
@@ -105,7 +102,7 @@ def sampling_table(lens: Lens, stride: int) -> SamplingTable:
 
 
 def distorted(lens: Lens, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns where the lens shows the ray (x, y, 1): its own normalized coordinates.
+    """Distorts the ray (x, y, 1): the normalized coordinates at which the lens shows it.
 
     The models are COLMAP's: a polynomial in the squared radius and a tangential part (Brown), or
     in the angle to the axis (fisheye).
@@ -294,7 +291,7 @@ class Source:
         return thinned(self.lenses[index].camera, self.stride)
 
     def with_depth(self, scale: float = 1.0, *, is_along_ray: bool = False) -> "Source":
-        """Returns the same with depth images converted; sparse points have no such mistakes.
+        """Returns the capture with its depth images converted; depth from points is refused.
 
         Args:
             scale: all depths are multiplied by this.
@@ -319,7 +316,7 @@ class Source:
         return dataclasses.replace(self, read=read)
 
     def frame(self, index: int, alignment: Alignment) -> Frame:
-        """Returns one image in the audit's coordinates.
+        """Reads one image in the audit's coordinates.
 
         Raises:
             FormatError, RunError: a file is missing or broken.
@@ -327,7 +324,7 @@ class Source:
         return self.framed(self.read(index), index, alignment)
 
     def framed(self, picture: Picture, index: int, alignment: Alignment) -> Frame:
-        """Returns an image that has been read, in the audit's coordinates."""
+        """Converts an image that has been read into the audit's coordinates."""
         rgb, depth = picture
         return Frame(
             rgb=jnp.asarray(rgb.astype(np.float32) / np.float32(255.0)),
@@ -341,7 +338,7 @@ class Source:
 
 
 def source_of(capture: Run | PosedImages, name: str) -> Source:
-    """Returns the any capture, to be audited.
+    """Makes any capture a source for an audit.
 
     Args:
         capture: what was opened; a recording with its poses as they are (`up="z"`).
@@ -426,7 +423,7 @@ def _of_images(images: PosedImages, name: str) -> Source:
 
 
 def _stride(lenses: tuple[Lens, ...] | list[Lens]) -> int:
-    """Returns one for all images: resolutions are compared between them."""
+    """Chooses one stride for all images, as resolutions are compared between them."""
     return max(-(-max(lens.width, lens.height) // MAX_SIDE) for lens in lenses)
 
 
@@ -449,7 +446,7 @@ def _thinned_colors(images: PosedImages, index: int, stride: int) -> tuple[np.nd
 
 
 def _cloud(images: PosedImages) -> tuple[np.ndarray, np.ndarray]:
-    """Returns points without tracks: no image is known to see them (as in a PLY)."""
+    """Returns the points without tracks: no image is known to see them (as in a PLY)."""
     if images.points is not None and len(images.points):
         xyz, rgb = images.points.xyz, images.points.rgb
     elif images.points_path is not None:

@@ -106,9 +106,9 @@ def places_of(
 
 
 def is_free_at(grid: OccupancyGrid, places: np.ndarray) -> np.ndarray:
-    """Returns which places [c, 3] lie in a cell known to be free, [c] bool.
+    """Returns a mask of the places [c, 3] in cells known to be free, [c] bool.
 
-    Outside of the grid none do.
+    Places outside of the grid are not free.
     """
     shape = np.array(grid.log_odds.shape)
     cells = np.floor((places - np.asarray(grid.origin)) / float(grid.cell_size)).astype(np.int64)
@@ -117,7 +117,7 @@ def is_free_at(grid: OccupancyGrid, places: np.ndarray) -> np.ndarray:
 
 
 def places_in_free_space(grid: OccupancyGrid, cameras: np.ndarray) -> np.ndarray:
-    """Returns centers of the free cells where a camera could be held, [c, 3] [audit units].
+    """Finds the centers of the free cells where a camera could be held, [c, 3] [audit units].
 
     Args:
         grid: free and occupied space.

@@ -80,7 +80,7 @@ def strays(cameras: np.ndarray, depth: float, points_of: Callable[[int], np.ndar
 
 
 def _groups(cameras: np.ndarray, reach: float) -> np.ndarray:
-    """Returns the group of each camera, [n]: those that a chain of steps within reach connects."""
+    """Labels the group of each camera, [n]: groups are connected by steps within reach."""
     steps = KDTree(cameras).query_pairs(reach, output_type="ndarray")
     links = (np.ones(len(steps), dtype=bool), (steps[:, 0], steps[:, 1]))
     count = len(cameras)
@@ -88,7 +88,7 @@ def _groups(cameras: np.ndarray, reach: float) -> np.ndarray:
 
 
 def _shares(camera: np.ndarray, shown: np.ndarray, tree: KDTree) -> bool:
-    """Returns True if what a camera shows is what others show, and large enough to be seen."""
+    """Returns True if a camera shows what others show, and at a sufficient size."""
     if not len(shown) or not tree.n:
         return False
     distance = np.linalg.norm(shown - camera, axis=1)
@@ -191,7 +191,7 @@ class Survey:
         return self.span < _ONE_PLACE * self.median_depth
 
     def length(self, in_audit: float) -> float:
-        """Returns a length of the audit, in the capture's units."""
+        """Converts a length of the audit to the capture's units."""
         return in_audit / self.alignment.scale
 
 
@@ -260,7 +260,7 @@ def _depth_images(source: Source, chosen: np.ndarray) -> list[DepthImage]:
 
 
 def _measured(source: Source, images: list[DepthImage]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns some of the depths [k] and their points [k, 3], in the capture's coordinates."""
+    """Draws some of the depths [k] and their points [k, 3], in the capture's coordinates."""
     rng = np.random.default_rng(0)
     local = [look.points(_VALUES, rng) for look in images]
     depths = np.concatenate([points[:, 2] for points in local])
@@ -286,7 +286,7 @@ def _check_depth(images: list[DepthImage], median: float) -> None:
 
 
 def _range(far: float, is_metric: bool, wanted: float | None) -> float:
-    """Returns how far images show things [capture units]."""
+    """Chooses the distance up to which images are used [capture units]."""
     if wanted is not None:
         if wanted > _FARTHEST * far:
             raise InputError(
@@ -302,7 +302,7 @@ def _range(far: float, is_metric: bool, wanted: float | None) -> float:
 
 
 def _strays(source: Source, chosen: np.ndarray, depth: float) -> np.ndarray:
-    """Returns which of the chosen images have poses that diverged."""
+    """Finds the chosen images whose poses have diverged."""
     rng = np.random.default_rng(0)
 
     def points_of(number: int) -> np.ndarray:

@@ -201,10 +201,7 @@ def _thinned(seen: Sequence[Normals]) -> Normals:
 
 
 def _distinct(directions: np.ndarray, weight: np.ndarray) -> float:
-    """Returns the effective number of different directions [k, 3].
-
-    The exponential of their entropy.
-    """
+    """Computes the effective number of different directions [k, 3]: exp of their entropy."""
     bins = fibonacci_lattice(_BINS)
     share = np.bincount(np.argmax(directions @ bins.T, axis=1), weight) / weight.sum()
     share = share[share > 0.0]
@@ -247,7 +244,7 @@ def _of_surfaces(up: np.ndarray, normals: Normals) -> np.ndarray:
 
 
 def _grid_round(direction: np.ndarray) -> np.ndarray:
-    """Returns a square grid of directions round one, [u, 3]."""
+    """Makes a square grid of directions around one, [u, 3]."""
     across = np.linalg.svd(direction[None])[2][1:]
     steps = np.linspace(-1.0, 1.0, _STEPS) * np.tan(np.radians(_AROUND))
     x, y = (side.reshape(-1, 1) for side in np.meshgrid(steps, steps))

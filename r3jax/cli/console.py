@@ -90,7 +90,7 @@ class TextColumn(rich.progress.TextColumn):
 
 
 def progress_bar(console: Console, *columns: ProgressColumn, transient: bool = False) -> Progress:
-    """Returns a bar that shows on a terminal only."""
+    """Makes a progress bar that shows on a terminal only."""
     return Progress(*columns, console=console, disable=not console.is_terminal, transient=transient)
 
 

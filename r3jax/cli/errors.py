@@ -43,15 +43,12 @@ def resumable(command: str, path: Path) -> Generator[None]:
 
 
 def one_line(error: BaseException) -> str:
-    """Returns an error's text without line breaks."""
+    """Writes an error's text without line breaks."""
     return " ".join(str(error).split())
 
 
 def printable(text: str) -> str:
-    """Returns the text whose control characters are spelled out.
-
-    A name may hold what moves the cursor.
-    """
+    """Spells out the control characters of a text: a name may contain some that move the cursor."""
     return "".join(c if c.isprintable() or c in _BLANKS else _spelled(c) for c in text)
 
 

@@ -165,7 +165,7 @@ def _default_of(field: dataclasses.Field[Any]) -> Any:
 
 
 def _described(hint: Any, text: str) -> Any:
-    """Returns a field's type with its help; None as a default says nothing, so it is not shown."""
+    """Adds help to a field's type; a default of None is not shown, as it says nothing."""
     inner = get_args(hint) if get_origin(hint) is Annotated else (hint,)
     if dataclasses.is_dataclass(inner[0]):
         for marker in inner[1:]:
@@ -190,7 +190,7 @@ def _default_shown(default: str) -> str:
 
 @functools.cache
 def _docstrings(kind: type) -> dict[str, str]:
-    """Returns the strings below the fields of a class and its bases, each as one line."""
+    """Collects the strings below the fields of a class and its bases, each as one line."""
     found: dict[str, str] = {}
     for base in reversed(kind.__mro__[:-1]):
         (node,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body

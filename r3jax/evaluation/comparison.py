@@ -23,7 +23,7 @@ POLICIES = (
 
 
 def method_name(cell: Cell) -> str:
-    """Returns the policy with the settings it was given: `active-gs`, `ours (lambda1=0.3)`."""
+    """Names a policy with its settings: `active-gs`, `r3 (lambda1=0.3)`."""
     settings = ", ".join(f"{name}={value}" for name, value in sorted(cell["settings"].items()))
     return f"{cell['policy']} ({settings})" if settings else cell["policy"]
 
@@ -34,7 +34,7 @@ def policy_of(method: str) -> str:
 
 
 def shared_settings(cells: Sequence[Cell]) -> dict[str, Any]:
-    """Returns settings that were given to the policies of all records alike, by name."""
+    """Returns the settings that all records have in common, by name."""
     first = cells[0]["settings"]
     missing = object()
     return {
@@ -45,7 +45,7 @@ def shared_settings(cells: Sequence[Cell]) -> dict[str, Any]:
 
 
 def with_short_names(cells: Sequence[Cell]) -> list[Cell]:
-    """Returns the same records, with names as short as this set of them allows.
+    """Shortens the names in records as far as they stay distinct.
 
     Settings that all share leave the methods' names, and a scene from a file is called by the
     file's name without folder and suffix, unless two scenes would then be called the same.
@@ -65,7 +65,7 @@ def with_short_names(cells: Sequence[Cell]) -> list[Cell]:
 
 
 def scene_title(scene: str) -> str:
-    """Returns the name of a scene, without folder and suffix where it is that of a file."""
+    """Returns the name of a scene; of a file, without its folder and suffix."""
     kind, colon, path = scene.partition(":")
     return PurePath(path).stem if colon and kind == "mesh" else scene
 
@@ -114,7 +114,7 @@ def terms_of(cell: Cell) -> dict[str, object]:
 
 
 def terms_in_scene(cell: Cell) -> dict[str, object]:
-    """Returns the same of what only those of one scene must share."""
+    """Returns the terms that only records of one scene must share."""
     return {
         "the scene's hash": cell["scene_hash"],
         "the hash of the test views": cell["test_views"]["hash"],
@@ -155,15 +155,15 @@ def _describe(cell: Cell) -> str:
 
 
 def scenes_of(cells: Sequence[Cell]) -> list[str]:
-    """Returns the scenes in alphabetical order."""
+    """Lists the scenes in alphabetical order."""
     return sorted({cell["scene"] for cell in cells})
 
 
 def methods_of(cells: Sequence[Cell]) -> list[str]:
-    """Returns the methods in the order of tables, whatever the order of the records.
+    """Lists the methods in the order of tables, whatever the order of the records.
 
-    Policies go as in `POLICIES` (those it does not know first), what is said of them in brackets,
-    such as their settings, alphabetically.
+    Policies have the order of `POLICIES`, unknown ones first; their settings are in alphabetical
+    order.
     """
     known = {policy: rank for rank, policy in enumerate(POLICIES)}
     names = {method_name(cell) for cell in cells}
@@ -172,7 +172,7 @@ def methods_of(cells: Sequence[Cell]) -> list[str]:
 
 
 def snapshots_of(cells: Sequence[Cell]) -> list[str]:
-    """Returns the snapshots (`views:30`, `seconds:120.5`, ...) by kind and size."""
+    """Lists the snapshots (`views:30`, `seconds:120.5`, ...) by kind and size."""
 
     def key(snapshot: str) -> tuple[str, float]:
         kind, _, size = snapshot.partition(":")
@@ -182,9 +182,9 @@ def snapshots_of(cells: Sequence[Cell]) -> list[str]:
 
 
 def view_values(cell: Cell, metric: str) -> np.ndarray | None:
-    """Returns one column of the record's test views, [V].
+    """Returns one column of the record's test views, [V], with NaN for null.
 
-    NaN for null, None if the column is null.
+    Returns None if the whole column is null.
     """
     column = cell["views"].get(metric)
     return None if column is None else np.array(column, dtype=np.float64)

@@ -53,12 +53,12 @@ class SheetView:
 
 
 def error_picture(truth: np.ndarray, render: np.ndarray) -> np.ndarray:
-    """Returns the mean absolute error over RGB per pixel, [H, W] in [0, 1], of two uint8 images."""
+    """Computes the mean absolute error of two uint8 images over RGB, [H, W] in [0, 1]."""
     return np.abs(truth.astype(np.float32) - render.astype(np.float32)).mean(axis=-1) / 255.0
 
 
 def contact_sheet(views: Sequence[SheetView], title: str) -> Figure:
-    """Returns one line per view: truth, render, error and (with a map) renderability.
+    """Draws one line per view: truth, render, error and (with a map) renderability.
 
     Args:
         views: in the order of the lines, usually the worst first (`scores.worst_rows`).
@@ -81,7 +81,7 @@ def contact_sheet(views: Sequence[SheetView], title: str) -> Figure:
     figure.set_layout_engine("none")  # images of one size, with the same space between all
 
     def place(line: int, column: int, height: float = cell, inset: float = 0.0) -> Axes:
-        """Returns axes for an image, or for the bar below the last one."""
+        """Adds axes for an image, or for the bar below the last one."""
         left = _MARGIN + _CAPTION + (_CELL + _GAP) * column + inset
         lower = size[1] - top - (cell + _GAP) * line - height
         wide = _CELL - 2.0 * inset

@@ -157,7 +157,7 @@ def _render_all(
     names: list[int],
     on_view: Callable[[int], None] | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns all views as bytes, [v, H, W, 3], and their coverage, [v]."""
+    """Renders all views as bytes, [v, H, W, 3], and their coverage, [v]."""
     is_open = config.max_intersections is None
     renders = np.empty(views.rgb.shape, dtype=np.uint8)
     coverage = np.empty(len(views), dtype=np.float32)
@@ -190,7 +190,7 @@ def _compare(
     truth: UInt8[Array, "b H W 3"],
     measured: Bool[Array, "b H W"],
 ) -> Float[Array, "b 4"]:
-    """Returns PSNR, SSIM, PSNR of the measured pixels, share of the measured pixels."""
+    """Computes PSNR, SSIM, PSNR of the measured pixels, and the share of the measured pixels."""
     x, y = _to_floats(renders), _to_floats(truth)
     share = jnp.mean(measured.astype(jnp.float32), axis=(-2, -1))
     return jnp.stack([psnr(x, y), ssim(x, y), psnr(x, y, measured), share], axis=-1)

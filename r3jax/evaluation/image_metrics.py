@@ -68,7 +68,7 @@ def psnr(
     truth: Float[Array, "*n H W 3"],
     valid: Bool[Array, "*n H W"] | None = None,
 ) -> Float[Array, "*n"]:
-    """Returns the peak signal-to-noise ratio of each image: -10 log10(mean squared error).
+    """Computes the peak signal-to-noise ratio of each image: -10 log10(mean squared error).
 
     Args:
         images: rendered, in [0, 1]; pass them through `to_8_bits` for the project's numbers.
@@ -95,7 +95,7 @@ def psnr(
 
 
 def ssim(images: Float[Array, "*n H W 3"], truth: Float[Array, "*n H W 3"]) -> Float[Array, "*n"]:
-    """Returns the structural similarity of each image (Wang et al. 2004), for data range 1.
+    """Computes the structural similarity of each image (Wang et al. 2004), for data range 1.
 
     11x11 Gaussian window with sigma 1.5, K1 = 0.01, K2 = 0.03; the mean over channels and over the
     pixels whose window lies inside the image. Equal to scikit-image's `structural_similarity` with
@@ -142,7 +142,7 @@ def _kernel() -> list[float]:
 
 @jax.custom_vjp
 def _window_means(stacked: Float[Array, "*n H W3"]) -> Float[Array, "*n h w3"]:
-    """Returns Gaussian means over the windows that lie inside the image; rows hold RGB triples.
+    """Computes Gaussian means over the windows inside the image; rows hold RGB triples.
 
     Sums of shifted slices, first along columns, then along rows: on CPUs XLA takes a tenth of the
     time of banded matrix products at 512 x 512, and a hundredth of a convolution's.
@@ -196,7 +196,7 @@ class Lpips(eqx.Module):
     def __call__(
         self, images: Float[Array, "n H W 3"], truth: Float[Array, "n H W 3"]
     ) -> Float[np.ndarray, " n"]:
-        """Returns the distance of each pair of images; 0 for equal ones, higher is worse.
+        """Computes the distance of each pair of images; 0 for equal ones, higher is worse.
 
         Not for use under jit: it cuts the images into batches that bound the memory, all of one
         size, and runs a jitted function on each.
@@ -241,7 +241,7 @@ class Lpips(eqx.Module):
 def _distances(
     metric: Lpips, images: Float[Array, "n H W 3"], truth: Float[Array, "n H W 3"]
 ) -> Float[Array, " n"]:
-    """Returns one batch, [0, 1] in."""
+    """Computes the distances of one batch of images in [0, 1]."""
     apply = _network(metric.network).apply
     to_range: Callable[[Array], Array] = lambda x: 2.0 * x - 1.0
     # The package leans on promotion of ranks, which callers may have forbidden.
@@ -251,7 +251,7 @@ def _distances(
 
 @functools.cache
 def load_lpips(network: str = "alex") -> Lpips:
-    """Returns LPIPS with the network of that name.
+    """Loads LPIPS with the network of that name.
 
     Args:
         network: `alex` (the default of the project's tables) or `vgg`.

@@ -52,7 +52,7 @@ class TestSet:
     """How many of them the model has seen; None if not known."""
 
     def frames(self) -> Iterator[Frame]:
-        """Returns every frame in order, as recorded."""
+        """Iterates over every frame in order, as recorded."""
         return frames_of(self.capture, self.numbers)
 
 
@@ -131,11 +131,10 @@ def _overlap(numbers: list[int], seen: list[int] | None) -> int | None:
 
 
 def mapped_views(model: TrainedModel, test: TestSet, capture: Capture) -> list[int]:
-    """Returns views of the capture for the map: those trained on.
+    """Returns the views of the capture for the map: those that the model was trained on.
 
-    None if the capture is other data.
-
-    Without a train.json all views but the tested ones, as a model of them most likely saw them.
+    If it was trained on other data, there are none. Without a train.json they are all views but the
+    tested ones, as a model of them most likely saw them.
     """
     if model.train_views is not None:
         return [number for number in model.train_views if number < len(capture)]
@@ -146,7 +145,7 @@ def mapped_views(model: TrainedModel, test: TestSet, capture: Capture) -> list[i
 
 
 def frames_of(capture: Capture, numbers: list[int]) -> Iterator[Frame]:
-    """Returns some frames of a capture, read one by one."""
+    """Iterates over some frames of a capture, reading one at a time."""
     return (capture.source.frame(number) for number in numbers)
 
 
@@ -239,7 +238,7 @@ def judge(
 
 
 def _map(capture: Capture, numbers: list[int]) -> MapState:
-    """Returns the map of some views, on the terms of the run if it is one."""
+    """Builds the map of some views, with the settings of the run if they are from one."""
     config = capture.run.header.config if capture.run is not None else {}
     return map_of(
         frames_of(capture, numbers),
@@ -303,7 +302,7 @@ def write_judgment(
 
 
 def _record(judgment: Judgment, spec: str) -> dict[str, Any]:
-    """Returns everything that the numbers depend on, and the numbers."""
+    """Collects the numbers, and everything that they depend on."""
     settings = judgment.settings
     summaries: dict[str, Any] = {}
     for summary in judgment.summaries:
@@ -329,7 +328,7 @@ def _record(judgment: Judgment, spec: str) -> dict[str, Any]:
 
 
 def _sheet(judgment: Judgment, worst: int):
-    """Returns the contact sheet of the worst views."""
+    """Draws the contact sheet of the worst views."""
     rows, renders = judgment.evaluation.rows, judgment.evaluation.renders
     place = {row.view: i for i, row in enumerate(rows)}
     lines: list[SheetView] = []

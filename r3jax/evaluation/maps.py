@@ -18,7 +18,7 @@ def map_of(
     num_bins: int = 64,
     drop_edges: bool = True,
 ) -> MapState:
-    """Returns the map that has seen these frames and no others; it grows as needed.
+    """Builds the map of these frames and no others; it grows as needed.
 
     A run's own map has seen the held-out views too, and would praise what a model trained without
     them cannot know.
@@ -37,7 +37,7 @@ def map_of(
 
 
 def expected_renderability(state: MapState, frames: Iterable[Frame]) -> list[float]:
-    """Returns R of each frame's view, in [0, 1].
+    """Computes R of each frame's view, in [0, 1].
 
     The frames must be as recorded, not made smaller: a voxel's resolution is compared with the
     one at which it was mapped.
@@ -46,5 +46,5 @@ def expected_renderability(state: MapState, frames: Iterable[Frame]) -> list[flo
 
 
 def expected_image(state: MapState, frame: Frame) -> np.ndarray:
-    """Returns R of what each pixel of a frame's view sees, [h, w] in [0, 1]."""
+    """Computes R of the surface at each pixel of a frame's view, [h, w] in [0, 1]."""
     return np.asarray(renderability_image(state, frame.camera, frame.T_world_camera))

@@ -104,7 +104,7 @@ class Summary:
 
 
 def summarize(rows: Sequence[ViewRow], *, seed: int = 0) -> tuple[Summary, ...]:
-    """Returns the mean, bootstrap interval, median and tail of every metric that has values.
+    """Computes the mean, bootstrap interval, median and tail of every metric that has values.
 
     The interval is the percentile bootstrap of the mean (Efron 1979): 4000 test sets of the same
     size are drawn from the views, with replacement. It says how much the choice of the test views
@@ -149,7 +149,7 @@ def _summary(metric: Metric, views: np.ndarray, values: np.ndarray, seed: int) -
 
 
 def bootstrap_interval(values: np.ndarray, *, seed: int = 0) -> tuple[float, float]:
-    """Returns 95 % interval of the mean by resampling the values, [n], n >= 1."""
+    """Computes the 95 % interval of the mean by resampling the values, [n], n >= 1."""
     if len(values) == 1:
         return float(values[0]), float(values[0])
     found = stats.bootstrap(

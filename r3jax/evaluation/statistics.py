@@ -43,7 +43,7 @@ class Estimate:
 
 
 def mean_over_scenes(scores: Scores, *, seed: int = 0, resamples: int = RESAMPLES) -> Estimate:
-    """Returns the mean over scenes of the mean over seeds and views, with a hierarchical interval.
+    """Computes the mean over scenes, seeds and views, with a hierarchical interval.
 
     Every scene weighs the same, whatever its number of views. A resample draws, in each scene,
     its seeds and (independently) its views with replacement; all drawn seeds share the
@@ -80,7 +80,7 @@ def mean_over_scenes(scores: Scores, *, seed: int = 0, resamples: int = RESAMPLE
 def paired_difference(
     first: Scores, second: Scores, *, seed: int = 0, resamples: int = RESAMPLES
 ) -> Estimate:
-    """Returns the first minus second, as `mean_over_scenes` of the differences view by view.
+    """Computes the first minus second, as `mean_over_scenes` of the differences view by view.
 
     The same test views evaluate all methods, so what makes a view hard cancels and the interval is
     far narrower than that of either mean. Seeds are paired row by row.

@@ -70,15 +70,15 @@ class Truth(Protocol):
         ...
 
     def free_positions(self, spacing: Sequence[float | int], margin: float | int) -> np.ndarray:
-        """Returns the reachable lattice points [P, 3] [m]."""
+        """Finds the reachable lattice points [P, 3] [m]."""
         ...
 
     def seen_share(self, poses: np.ndarray) -> np.ndarray:
-        """Returns the share of a view that shows a surface, [V] in [0, 1]."""
+        """Computes the share of each view that shows a surface, [V] in [0, 1]."""
         ...
 
     def frames(self, poses: np.ndarray, camera: Camera) -> Iterator[Frame]:
-        """Returns frames without noise at poses [V, 4, 4]."""
+        """Renders frames without noise at poses [V, 4, 4]."""
         ...
 
 
@@ -181,7 +181,7 @@ def load_view_set(
     margin: float | int = MARGIN,
     max_views: int | None = None,
 ) -> ViewSet:
-    """Returns the stored test views of a scene; computed and stored if they are not there yet.
+    """Loads the test views of a scene; computes and stores them if they are not there yet.
 
     Several processes may call this at once: all get the same views.
 
@@ -213,7 +213,7 @@ def load_view_set(
 def render_view_set(
     truth: Truth, view_set: ViewSet, resolution: int, fov: float | int = 60.0
 ) -> Iterator[Frame]:
-    """Returns the truth at every test view: exact depth without limit of range.
+    """Renders the truth at every test view: exact depth without limit of range.
 
     Args:
         truth: the scene.
@@ -254,11 +254,10 @@ _AGAIN = "delete the file and it is computed again"
 
 
 def _evenly(positions: np.ndarray, spacing: Sequence[float | int], count: int) -> np.ndarray:
-    """Returns indices of `count` of the positions [P, 3], in order.
+    """Chooses `count` of the positions [P, 3], evenly spaced along a Morton curve.
 
-    Evenly spaced along a Morton curve.
-
-    Neighbors along the curve are neighbors in space, so that each region keeps its share.
+    Neighbors along the curve are neighbors in space, so that each region keeps its share. Returns
+    their indices in order.
     """
     if count >= len(positions):
         return np.arange(len(positions))
@@ -271,7 +270,7 @@ def _evenly(positions: np.ndarray, spacing: Sequence[float | int], count: int) -
 
 
 def _settings(view_set: ViewSet) -> list[Any]:
-    """Returns everything but the views, as JSON holds it."""
+    """Returns everything but the views, in the form that JSON stores."""
     return [view_set.scene_hash, [*view_set.spacing], view_set.margin, view_set.max_views]
 
 
@@ -306,7 +305,7 @@ def _write(path: Path, view_set: ViewSet) -> None:
 
 
 def _from_record(record: dict[str, Any]) -> ViewSet:
-    """Returns the set that a stored record describes."""
+    """Makes the set that a stored record describes."""
     check_fields("set", record, _KINDS)
     x, y, z = (float(side) for side in record["spacing"])
     views = record["views"]

@@ -62,9 +62,9 @@ class CaptureSettings:
         return self.motion.speed or self.config.speed
 
     def flight(self, decision: Decision) -> float:
-        """Returns seconds to the chosen view.
+        """Returns the seconds of the flight to the chosen view.
 
-        The policy's own account of its motion, if it has one.
+        If the policy plans its own motion, they are the policy's.
         """
         if decision.seconds is not None:
             return decision.seconds
@@ -72,9 +72,9 @@ class CaptureSettings:
 
 
 def scoring_on_the_way(config: ExplorationConfig) -> ScoringConfig:
-    """Returns settings of the utility of a frame captured while moving.
+    """Returns the settings of the utility of a frame captured while moving.
 
-    The same for every policy.
+    They are the same for every policy.
     """
     return ScoringConfig(max_range=jnp.asarray(config.max_range, jnp.float32))
 
@@ -158,7 +158,7 @@ def begin_leg(
 def _in_pieces(
     num: int, decision: Decision, info: PlanInfo, T_world_camera: np.ndarray, rules: CaptureSettings
 ) -> Leg:
-    """Returns the leg of a path in `num` pieces, two or more."""
+    """Divides a path into `num` pieces, two or more."""
     places = points_along(decision.waypoints, num)
     places[-1] = decision.T_world_camera[:3, 3]
     flight = rules.flight(decision)
@@ -172,7 +172,7 @@ def _in_pieces(
 
 
 def allowed_turns(stops: np.ndarray, seconds: np.ndarray, rules: CaptureSettings) -> np.ndarray:
-    """Returns the largest turn on each piece of a path, [n] [rad]; inf: any.
+    """Computes the largest turn on each piece of a path, [n] [rad]; inf if it is not limited.
 
     Args:
         stops: where the pieces begin and end, [n + 1, 3] [m].
@@ -231,7 +231,7 @@ def aim(
 def observe_view(
     planner: Planner, frame: Frame, rules: CaptureSettings, *, captured: bool
 ) -> Planner:
-    """Returns `observe` of a frame of the loop.
+    """Calls `observe` with a frame of the loop.
 
     No decision follows a frame that was captured while moving: the cells that it failed to show
     are counted here.

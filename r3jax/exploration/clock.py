@@ -53,7 +53,7 @@ class ModelClock:
 
 
 def model_clock(config: ExplorationConfig) -> ModelClock:
-    """Returns the clock of fixed costs; a decision's and a frame's are settings."""
+    """Makes the clock of fixed costs; the costs of a decision and of a frame are settings."""
     return ModelClock(
         {
             "planning": config.planning_seconds,
@@ -65,7 +65,7 @@ def model_clock(config: ExplorationConfig) -> ModelClock:
 
 
 def make_clock(config: ExplorationConfig) -> Clock:
-    """Returns the clock that the settings name: `wall` or `model`."""
+    """Makes the clock that the settings name: `wall` or `model`."""
     return WallClock() if config.clock == "wall" else model_clock(config)
 
 

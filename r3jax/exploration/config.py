@@ -187,9 +187,9 @@ class ExplorationConfig(MappingConfig):
         return self.capture_every is not None or self.capture_rate is not None
 
     def piece_at(self, speed: float) -> float:
-        """Returns the longest piece of a path between two frames at a speed [m/s], [m]; inf.
+        """Returns the longest piece of a path between two frames at a speed [m/s], [m].
 
-        No captures.
+        It is inf if nothing is captured while moving.
         """
         if self.capture_rate is not None:
             return max(speed / self.capture_rate, LEAST_PIECE)

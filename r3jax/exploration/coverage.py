@@ -34,13 +34,13 @@ def _renderability_of_views(
 def view_renderability(
     map_state: MapState, camera: Camera, T_world_camera: Float[Array, "4 4"]
 ) -> float:
-    """Returns the renderability of one view of the map, as a number on the host."""
+    """Computes the renderability of one view of the map, as a number on the host."""
     return float(_renderability_of_views(map_state, camera, T_world_camera[None])[0])
 
 
 @functools.lru_cache(maxsize=4)
 def _probe_sequence(lower: tuple[float, ...], upper: tuple[float, ...]) -> tuple[np.ndarray, ...]:
-    """Returns positions [n, 3] and directions [n, 3], evenly spread, the same for every run."""
+    """Draws positions [n, 3] and directions [n, 3], evenly spread, the same for every run."""
     from scipy.stats import qmc  # half a second, which a page that only looks on need not wait for
 
     # Not scrambled: equal runs must write equal rows, and runs of one scene share their probes.
@@ -54,9 +54,7 @@ def _probe_sequence(lower: tuple[float, ...], upper: tuple[float, ...]) -> tuple
 
 
 def probe_poses(grid: OccupancyGrid, num: int) -> np.ndarray:
-    """Returns the probe views of a grid.
-
-    The first `num` of a fixed sequence that lie in free space.
+    """Returns the probe views: the first `num` of a fixed sequence that lie in free space.
 
     The sequence covers the whole box and does not depend on the run. A probe counts once its
     cell and all the cells round it are known to be free, so the set grows into every new room
@@ -92,7 +90,7 @@ def _poses_along(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
 
 
 def mean_renderability(map_state: MapState, grid: OccupancyGrid, camera: Camera, num: int) -> float:
-    """Returns the mean renderability of the probe views; 0 while there is none."""
+    """Computes the mean renderability of the probe views; 0 while there is none."""
     poses = probe_poses(grid, num)
     if len(poses) == 0:
         return 0.0
@@ -111,7 +109,7 @@ def measure_coverage(
     arrival_renderability: float,
     num_probes: int,
 ) -> Coverage:
-    """Returns everything that a row says about the state after its view."""
+    """Measures everything that a row says about the state after its view."""
     unexplored = np.asarray(grid.unexplored)
     known = int(unexplored.size - unexplored.sum())
     return Coverage(

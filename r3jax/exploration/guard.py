@@ -147,7 +147,7 @@ class GuardedSimulator:
         self._pose = np.array(T_world_camera, dtype=np.float64)
 
     def render(self, T_world_camera: np.ndarray) -> Frame:
-        """Returns the frame at the pose that was committed, once.
+        """Renders the frame at the pose that was committed, once.
 
         Raises:
             OracleReadError: another pose, or the same one again.

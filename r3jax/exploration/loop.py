@@ -61,10 +61,7 @@ class RecordedViews(Protocol):
         ...
 
     def newest_state(self, start: LoopState) -> LoopState:
-        """Returns the newest stored state that can be used.
-
-        `start`, the first one, if there is none.
-        """
+        """Returns the newest stored state that can be used, or `start` if there is none."""
         ...
 
 
@@ -162,9 +159,7 @@ def explore(
 def _continued(
     run: RecordedViews, mission: Mission, start: LoopState, *, decided_from: int
 ) -> LoopState:
-    """Returns the state after the last recorded view.
-
-    Of the newest stored state, and the views since.
+    """Rebuilds the state after the last recorded view, from the newest stored state.
 
     Rows and frames alone rebuild the state, from the first view if need be; a stored state saves
     the time. So one that is missing, damaged or of another version costs time, not the run.

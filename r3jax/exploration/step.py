@@ -42,7 +42,7 @@ from r3jax.planning.robot.motion import motion_of
 def start_state(
     mission: Mission, init_key: jax.Array, other_starts: Iterable[np.ndarray] = ()
 ) -> LoopState:
-    """Returns the state before the first view.
+    """Makes the state before the first view.
 
     Args:
         mission: settings of the run.
@@ -68,9 +68,9 @@ def start_state(
 def step(
     state: LoopState, mission: Mission, *, exchange: float = 0.0
 ) -> tuple[LoopState, TakenView | Stop]:
-    """Returns one frame: decide where to go (the first view is taken at the start), fly, look, map.
+    """Takes one frame: decides where to go (not at the start), flies, captures and maps.
 
-    Where a path is under way nothing is decided: the next frame on it is taken.
+    While a path is under way nothing is decided: the next frame on it is taken.
 
     Args:
         state: before the frame.
@@ -118,7 +118,7 @@ class _Chosen(NamedTuple):
 
 
 def _choose(state: LoopState, mission: Mission) -> _Chosen:
-    """Returns decides where to go; what was decided while moving is reconsidered."""
+    """Decides where to go; a decision made while moving is reconsidered."""
     mission.on_stage("plan")
     clock, planned = mission.clock, state.planned
     # By the number of the view, so that a resumed run draws what it would have drawn.
@@ -219,7 +219,7 @@ def _next_frame(
 
 
 def _no_decision(state: LoopState, mission: Mission, info: PlanInfo) -> Stop:
-    """Returns the policy's reason, in words."""
+    """Describes why the policy made no decision."""
     return Stop(
         StopReason(info.outcome.value),
         f"after {state.counts} the policy {state.planner.policy.name!r} drew "
@@ -339,9 +339,7 @@ def _render(mission: Mission, view: int, T_world_camera: np.ndarray) -> Frame:
 def relive(
     state: LoopState, mission: Mission, row: StepRow, frame: Frame, *, decides: bool = True
 ) -> tuple[LoopState, Decision | None]:
-    """Returns the state after a frame that was recorded.
-
-    As `step` leaves it, without the simulator.
+    """Recomputes the state after a recorded frame, as `step` leaves it, without the simulator.
 
     Args:
         state: before the frame.
@@ -389,9 +387,10 @@ def _arrive(
     *,
     captured: bool,
 ) -> LoopState:
-    """Returns one frame more: the pose is the frame's, and the totals count the path to it.
+    """Adds one frame: the pose is the frame's, and the totals include the path to it.
 
-    The recorded pose (float32) is the pose from here on: a run read back goes on the same way.
+    The recorded pose (float32) is the pose from here on, so that a run that was read back goes on
+    identically.
     """
     pose = np.asarray(frame.T_world_camera, dtype=np.float64)
     return replace(

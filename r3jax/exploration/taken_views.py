@@ -127,15 +127,12 @@ class StepRow:
 
 
 def unit_of(rows: Iterable[StepRow]) -> str:
-    """Returns names what rows count: views, or frames where some were captured while moving."""
+    """Names what rows count: views, or frames where some were captured while moving."""
     return "frames" if any(row.captured for row in rows) else "views"
 
 
 def name_of(row: StepRow, rows: Iterable[StepRow]) -> str:
-    """Returns names a row by its number.
-
-    `view 3`, or `frame 12` in runs with frames between views.
-    """
+    """Names a row by its number: `view 3`, or `frame 12` in runs with frames between views."""
     return f"{unit_of(rows)[:-1]} {row.step + 1}"
 
 
@@ -156,7 +153,7 @@ class TakenView:
 
 
 def make_choice(decision: Decision, info: PlanInfo) -> Choice:
-    """Returns what the trace keeps of a decision."""
+    """Makes the record of a decision for the trace."""
     total = np.asarray(decision.utilities.get("total", np.zeros(0)), dtype=np.float64)
     # Unreachable candidates have no utility; stable, so that equal ones keep the order of drawing.
     best = np.argsort(-np.where(np.isfinite(total), total, -np.inf), kind="stable")
@@ -177,12 +174,12 @@ def make_choice(decision: Decision, info: PlanInfo) -> Choice:
 
 
 def finite_or_none(value: float) -> float | None:
-    """Returns JSON knows neither inf nor NaN."""
+    """Replaces inf and NaN, which JSON cannot contain, by None."""
     return float(value) if math.isfinite(value) else None
 
 
 def to_integers(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the color [H, W, 3] uint8 and depth [H, W] uint16 in steps of 0.2 mm."""
+    """Converts a frame to color [H, W, 3] uint8 and depth [H, W] uint16 in steps of 0.2 mm."""
     rgb = np.rint(np.asarray(frame.rgb) * np.float32(255.0)).astype(np.uint8)
     depth = np.asarray(frame.depth)
     # inf times a number is inf, and its integer is undefined: it gets its own value below.
@@ -198,7 +195,7 @@ def to_integers(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
 def from_integers(
     rgb: np.ndarray, depth: np.ndarray, T_world_camera: np.ndarray, camera: Camera
 ) -> Frame:
-    """Returns the frame that stored images stand for: inverse of `to_integers`."""
+    """Makes the frame that stored images represent: the inverse of `to_integers`."""
     metres = depth.astype(np.float32) / np.float32(DEPTH_STEPS_PER_METRE)
     return Frame(
         rgb=jnp.asarray(rgb.astype(np.float32) / np.float32(255.0)),
@@ -209,13 +206,13 @@ def from_integers(
 
 
 def stored_form(frame: Frame) -> Frame:
-    """Returns the frame as it will be read back: rounded to 8-bit color and 0.2 mm of depth."""
+    """Rounds a frame to its stored form: 8-bit color and 0.2 mm of depth."""
     rgb, depth = to_integers(frame)
     return from_integers(rgb, depth, np.asarray(frame.T_world_camera), frame.camera)
 
 
 def content_hash(rgb: np.ndarray, depth: np.ndarray) -> str:
-    """Returns SHA-256 over the stored pixels; it does not depend on the PNG compressor."""
+    """Computes SHA-256 over the stored pixels; it does not depend on the PNG compressor."""
     digest = hashlib.sha256(np.ascontiguousarray(rgb).tobytes())
     # Little-endian by name: the hash must be the same on every machine.
     digest.update(np.ascontiguousarray(depth).astype("<u2").tobytes())
@@ -223,5 +220,5 @@ def content_hash(rgb: np.ndarray, depth: np.ndarray) -> str:
 
 
 def frame_hash(frame: Frame) -> str:
-    """Returns `content_hash` of a frame."""
+    """Computes `content_hash` of a frame."""
     return content_hash(*to_integers(frame))

@@ -98,7 +98,7 @@ class Capture:
         return len(self.source.rows if isinstance(self.source, Run) else self.source)
 
     def frames(self) -> Iterator[Frame]:
-        """Yields every frame in order, read one by one."""
+        """Iterates over every frame in order, reading one at a time."""
         return self.source.frames()
 
     @property

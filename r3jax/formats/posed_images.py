@@ -233,7 +233,7 @@ class PosedImages:
         return resample_depth(stored, self.lenses[index], own)
 
     def frames(self) -> Iterator[Frame]:
-        """Yields every frame in order, read one by one."""
+        """Iterates over every frame in order, reading one at a time."""
         return (self.frame(index) for index in range(len(self)))
 
 

@@ -53,5 +53,5 @@ def _environment() -> Environment:
 
 
 def data_url(image: bytes, kind: str = "png") -> str:
-    """Returns an address that holds the image, so that a page can be sent as one file."""
+    """Encodes an image as a data URL, so that a page is a single file."""
     return f"data:image/{kind};base64,{base64.b64encode(image).decode()}"

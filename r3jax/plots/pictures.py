@@ -39,7 +39,7 @@ _HEADROOM = 0.35
 def floor_picture(
     map_state: MapState, grid: OccupancyGrid, height: float
 ) -> tuple[np.ndarray, tuple[float, float, float, float]]:
-    """Returns the place from above, cut open over the cameras' heads.
+    """Draws the place from above, cut open above the cameras.
 
     Light gray is unexplored at the cameras' height, white is free, dark gray is occupied; on
     top lie the highest voxels below the cut, in their mean color.
@@ -106,7 +106,7 @@ def panorama_picture(
     T_world_camera: np.ndarray,
     max_range: float,
 ) -> PanoramaPicture:
-    """Returns the renderability in all directions from a camera's position.
+    """Computes the renderability in all directions from a camera's position.
 
     Args:
         map_state: the voxels.
@@ -156,7 +156,7 @@ def _is_free_to(grid: OccupancyGrid, position: np.ndarray, max_range: float) -> 
 
 
 def _nearest_rows(map_state: MapState, position: np.ndarray, max_range: float) -> np.ndarray:
-    """Returns the map row that is seen in every direction, [h, w]; N where there is none.
+    """Finds the map row that is seen in every direction, [h, w]; N where there is none.
 
     A painter's picture: every voxel covers the angle of its edge, the far ones are painted
     first. The first column looks along azimuth +180 degrees, the first row straight up.
@@ -191,10 +191,7 @@ _NEVER_SEEN = "#9ca3af"
 
 
 def panorama_figure(picture: PanoramaPicture) -> Figure:
-    """Returns all directions from one position.
-
-    What the map knows, and how well it would render.
-    """
+    """Draws all directions from one position: the mapped colors, and the renderability."""
     figure = style.new_figure(10.0, 9.6)
     upper, lower = figure.subplots(2, 1)
     extent = (180.0, -180.0, -90.0, 90.0)
@@ -236,13 +233,13 @@ def show_renderability(
 
 
 def empty_directions() -> list[Patch]:
-    """Returns entries of a legend for directions without a voxel."""
+    """Makes the legend's entries for directions without a voxel."""
     kinds = (("beyond the sensor's range", BEYOND), ("never seen", _NEVER_SEEN))
     return [Patch(facecolor=color, edgecolor=style.MUTED, label=name) for name, color in kinds]
 
 
 def small_png(rgb: np.ndarray, pose: np.ndarray, up: np.ndarray, side: int) -> bytes:
-    """Returns a small PNG of an image, turned by quarters until the vertical points up.
+    """Makes a small PNG of an image, turned by quarters until the vertical points up.
 
     Args:
         rgb: colors, [H, W, 3] uint8.
@@ -258,7 +255,7 @@ def small_png(rgb: np.ndarray, pose: np.ndarray, up: np.ndarray, side: int) -> b
 
 
 def png(rgb: np.ndarray) -> bytes:
-    """Returns a PNG of an image [H, W, 3] uint8."""
+    """Encodes an image [H, W, 3] uint8 as PNG."""
     buffer = io.BytesIO()
     Image.fromarray(rgb).save(buffer, format="png", compress_level=1)
     return buffer.getvalue()

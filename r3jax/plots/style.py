@@ -45,7 +45,7 @@ SCORE_MAP = "RdYlGn"
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Returns an empty figure of that size [inch] without pyplot's global state."""
+    """Makes an empty figure of that size [inch] without pyplot's global state."""
     return Figure(figsize=(width, height), dpi=110, layout="constrained", facecolor="white")
 
 
@@ -64,7 +64,7 @@ def dress(axes: Axes, title: str = "", x: str = "", y: str = "") -> Axes:
 
 
 def blank(axes: Axes, title: str = "") -> Axes:
-    """Returns axes for an image: no ticks, no grid."""
+    """Prepares axes for an image: no ticks, no grid."""
     dress(axes, title)
     axes.grid(visible=False)
     axes.set_xticks([])
@@ -77,7 +77,7 @@ def blank(axes: Axes, title: str = "") -> Axes:
 def picture_grid(
     lines: int, columns: int, aspect: float, space: float
 ) -> tuple[Figure, np.ndarray]:
-    """Returns a figure 10 inches wide for images of one shape.
+    """Makes a figure 10 inches wide for images of one shape.
 
     Args:
         lines: of images.
@@ -121,9 +121,9 @@ PNG_MARK = b"tEXtSoftware\x00r3jax"
 
 
 def to_png(figure: Figure) -> bytes:
-    """Returns the figure as PNG bytes. Dollar signs in names are no formulas.
+    """Encodes the figure as PNG.
 
-    Log axes write theirs so.
+    Dollar signs in names are not read as formulas; log axes use them for theirs.
     """
     numbers = {label for tick in figure.findobj(Tick) for label in (tick.label1, tick.label2)}
     for text in figure.findobj(Text):

@@ -155,9 +155,9 @@ def _refuse_half_a_fork(run: Run) -> None:
 
 
 def _as_flown(rows: Sequence[StepRow]) -> list[StepRow]:
-    """Returns the rows; a path that was left before its end is cut to what was flown.
+    """Cuts the path of a choice to the part that was flown, if the path was left before its end.
 
-    Who takes over is told the path, and must not take for visited what lies ahead.
+    A policy that takes over is given the path, and must not count what lies ahead as visited.
     """
     flown = list(rows)
     begins = [number for number, row in enumerate(rows) if row.choice is not None]
@@ -246,7 +246,7 @@ def _header(runs: list[Run]) -> RunHeader:
 
 
 def _behind(row: StepRow, before: StepRow | None) -> StepRow:
-    """Returns a row of a later run, numbered on behind the last row of the runs before."""
+    """Renumbers a row of a later run to follow the last row of the runs before."""
     if before is None:
         return row
     return replace(

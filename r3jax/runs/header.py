@@ -133,7 +133,7 @@ def policy_fields(policy: Policy) -> dict[str, Any]:
 
 
 def settings_of(policy: object) -> dict[str, Any]:
-    """Returns what JSON can hold of a policy's settings.
+    """Returns the settings of a policy that JSON can contain.
 
     A free-flying camera's motion is left out, and so are refinement where there is none and the
     mounting of a camera that turns by itself: that is what their absence has always meant.
@@ -150,7 +150,7 @@ def settings_of(policy: object) -> dict[str, Any]:
 
 
 def package_versions() -> dict[str, str]:
-    """Returns versions of what shapes the result on this machine."""
+    """Returns the versions of the packages and the machine that shape the result."""
     import jax  # only here is a device needed
 
     versions: dict[str, str] = {
@@ -166,7 +166,7 @@ def package_versions() -> dict[str, str]:
 
 
 def header_to_json(header: RunHeader) -> str:
-    """Returns the text of run.json."""
+    """Writes the text of run.json."""
     # Format and version come first, for those who open the file by hand.
     plain = {"format": FORMAT, "version": VERSION, **dataclasses.asdict(header)}
     # NaN would become a word that `parse_json` refuses: the run could never be read.

@@ -61,15 +61,15 @@ class Run:
         return f"{self.end.outcome}: {self.end.message}"
 
     def image_path(self, step: int) -> Path:
-        """Returns where the color image of a view lies."""
+        """Returns the path of the color image of a view."""
         return self.path / "frames" / f"{step:06d}.png"
 
     def depth_path(self, step: int) -> Path:
-        """Returns where the depth image of a view lies."""
+        """Returns the path of the depth image of a view."""
         return self.path / "frames" / f"{step:06d}.depth.png"
 
     def frame(self, step: int) -> Frame:
-        """Returns the frame of one view, as it entered the map.
+        """Reads the frame of one view, as it entered the map.
 
         Raises:
             RunError: an image is missing, broken, or not the one that was recorded.
@@ -77,7 +77,7 @@ class Run:
         return from_integers(*self.images(step), self.rows[step].pose, self.camera)
 
     def images(self, step: int) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the images of one view as they are stored: [H, W, 3] uint8 and [H, W] uint16.
+        """Reads the images of one view as they are stored: [H, W, 3] uint8 and [H, W] uint16.
 
         Raises:
             RunError: an image is missing, broken, or not the one that was recorded.
@@ -91,19 +91,19 @@ class Run:
         return rgb, depth
 
     def frames(self) -> Iterator[Frame]:
-        """Returns every frame in order, read one by one."""
+        """Iterates over every frame in order, reading one at a time."""
         return (self.frame(row.step) for row in self.rows)
 
     def checkpoint(self) -> tuple[int, MapState, OccupancyGrid]:
-        """Returns the newest stored map and grid, and the view after which they were stored."""
+        """Reads the newest stored map and grid, and the view after which they were stored."""
         return read_checkpoint(self.path / "checkpoints")
 
     def checkpoint_steps(self) -> list[int]:
-        """Returns the views after which a state is stored, oldest first."""
+        """Lists the views after which a state is stored, oldest first."""
         return checkpoint_steps(self.path / "checkpoints")
 
     def load_checkpoint(self, step: int) -> dict[str, dict[str, np.ndarray]]:
-        """Returns the arrays of a stored state, by table.
+        """Reads the arrays of a stored state, by table.
 
         Raises:
             RunError: there is none for that view, or it cannot be read.
@@ -111,10 +111,7 @@ class Run:
         return load_checkpoint(self.path / "checkpoints", step)
 
     def newest_state(self, start: LoopState) -> LoopState:
-        """Returns the newest stored state of the loop that can be used.
-
-        `start`, the first, if none is.
-        """
+        """Reads the newest stored state that can be used; returns `start` if there is none."""
         return newest_state(self.path / "checkpoints", self.rows, start)
 
 
@@ -165,7 +162,7 @@ def read_png(path: Path, width: int, height: int, *, is_depth: bool) -> np.ndarr
 
 
 def complete_lines(path: Path) -> list[str]:
-    """Returns lines that end in a newline: a power cut may have torn the last one.
+    """Reads the lines that end in a newline: a power cut may have torn the last one.
 
     Raises:
         RunError: missing, not permitted, or larger than any trace.

@@ -48,7 +48,7 @@ class Reason:
 
 
 def reason_of(explanation: Explanation, grid: OccupancyGrid) -> Reason:
-    """Returns what an explanation says of what the view sees.
+    """Summarizes an explanation for what the view sees.
 
     Args:
         explanation: of one view.

@@ -32,7 +32,7 @@ class Difference:
 def rebuild(
     runs: Sequence[Run], views: int | None = None, on_frame: Callable[[], None] = lambda: None
 ) -> tuple[MapState, OccupancyGrid]:
-    """Returns the map and the grid that have seen what the runs have seen, one run after the other.
+    """Rebuilds the map and the grid from the frames of all runs, one run after the other.
 
     Args:
         runs: of one scene: the same box, cells, voxels and range.
@@ -46,9 +46,9 @@ def rebuild(
 
 
 def rebuild_team(runs: Sequence[Run]) -> tuple[MapState, OccupancyGrid]:
-    """Returns the map and the grid of a team after its last meeting.
+    """Rebuilds the map and the grid of a team after its last meeting.
 
-    All frames, in the clock's order.
+    All frames are added in the order of the clock.
 
     Raises:
         RunError: the runs do not fit together, or a frame is missing or broken.
@@ -59,7 +59,7 @@ def rebuild_team(runs: Sequence[Run]) -> tuple[MapState, OccupancyGrid]:
 
 
 def states_of(run: Run) -> Iterator[tuple[MapState, OccupancyGrid]]:
-    """Returns the map and the grid after each view of a run, in order, lazily.
+    """Rebuilds the map and the grid after each view of a run, in order, lazily.
 
     Raises:
         RunError: no view, settings that cannot work, or a frame that is missing or broken.
@@ -94,13 +94,13 @@ def _states(
 
 
 def _first(runs: Sequence[Run]) -> tuple[MapState, OccupancyGrid]:
-    """Returns the map and the grid before the first view of runs in one scene."""
+    """Makes the map and the grid before the first view of runs in one scene."""
     config = config_of(runs[0])
     return first_map(config), grid_before(runs)
 
 
 def team_of(run: Run) -> list[Run]:
-    """Returns the runs of all members of the team that a run flew in, in order.
+    """Reads the runs of all members of the team that a run flew in, in order.
 
     Raises:
         RunError: it flew in none; one is missing, or was cut off before the last meeting.
@@ -121,7 +121,7 @@ def team_of(run: Run) -> list[Run]:
 
 
 def grid_before(runs: Sequence[Run]) -> OccupancyGrid:
-    """Returns the grid before the first view of runs in one scene.
+    """Makes the grid before the first view of runs in one scene.
 
     Raises:
         RunError: a run without a view, or settings that cannot work.
@@ -155,9 +155,9 @@ def is_decided_apart(run: Run) -> bool:
 def differences(
     run: Run, on_frame: Callable[[], None] = lambda: None
 ) -> tuple[int, list[Difference]]:
-    """Returns where the newest stored map and grid are not those that the frames rebuild.
+    """Finds the differences between the newest stored map and grid and those rebuilt from frames.
 
-    Those of a run that flew in a team are rebuilt from the frames of all its members.
+    For a run that flew in a team, the frames of all its members are used.
 
     Args:
         run: with a stored map.
@@ -200,12 +200,12 @@ def _compare(name: str, stored: jax.Array, rebuilt: jax.Array) -> Difference | N
 
 
 def parts_of(run: Run) -> list[int]:
-    """Returns views of each run that a merged one is made of; all views of any other."""
+    """Returns the number of views of each run in a merged one; of any other run, all its views."""
     return (run.header.parent or {}).get("merged_views", [len(run.rows)])
 
 
 def starts_of(run: Run) -> list[np.ndarray]:
-    """Returns where a run began; a merged one began several times."""
+    """Returns the poses at which a run began; a merged one began several times."""
     if not run.rows:
         raise RunError(run.path, "the run has no view")
     # The last part begins no other: its sum would be one past the last row.

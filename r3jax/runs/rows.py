@@ -32,7 +32,7 @@ class EndRow:
 
 
 def to_json(row: StepRow | EndRow) -> str:
-    """Returns one line of trace.jsonl, keys in a fixed order."""
+    """Writes one line of trace.jsonl, keys in a fixed order."""
     kind = "step" if isinstance(row, StepRow) else "end"
     plain = {"kind": kind, **dataclasses.asdict(row, dict_factory=_plain_dict)}
     if not plain.get("captured", True):
@@ -44,7 +44,7 @@ def to_json(row: StepRow | EndRow) -> str:
 
 
 def from_json(line: str) -> StepRow | EndRow:
-    """Returns the inverse of `to_json`.
+    """Parses a line that `to_json` wrote.
 
     Raises:
         ForeignFileError: the line is not a row; a field is missing, unknown or of another type; a

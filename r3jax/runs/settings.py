@@ -29,7 +29,7 @@ class RunSettings:
     policy: Policy
 
     def with_limits(self, budget: str | None, until: str | None) -> "RunSettings":
-        """Returns the same with another budget or goal where one is given.
+        """Replaces the budget or the goal where one is given.
 
         Raises:
             ValueError: a budget or a goal that cannot work.
@@ -44,7 +44,7 @@ class RunSettings:
 
 
 def config_of(run: Run) -> ExplorationConfig:
-    """Returns the settings of the loop that a run was made with.
+    """Reads the settings of the loop that a run was made with.
 
     Raises:
         RunError: a setting that this version does not know, or cannot work with.
@@ -57,9 +57,7 @@ def config_of(run: Run) -> ExplorationConfig:
 
 
 def policy_key(run: Run) -> str:
-    """Returns what `make_policy` knows a run's policy by.
-
-    Its name, or its class if it is a plug-in.
+    """Returns the name by which `make_policy` finds a run's policy, or the class of a plug-in.
 
     Raises:
         KeyError: the header does not say.
@@ -69,9 +67,9 @@ def policy_key(run: Run) -> str:
 
 
 def _config_class(run: Run) -> type[PlannerConfig]:
-    """Returns the settings of a run's policy.
+    """Finds the class of the settings of a run's policy.
 
-    Those that all share if the policy is not to be had.
+    If the policy is not available, it is the class that all policies share.
     """
     try:
         return config_class(policy_key(run))
@@ -80,7 +78,7 @@ def _config_class(run: Run) -> type[PlannerConfig]:
 
 
 def planner_config_of(run: Run) -> PlannerConfig:
-    """Returns the settings of the policy that a run was made with.
+    """Reads the settings of the policy that a run was made with.
 
     Raises:
         RunError: a setting that this version does not know, or cannot work with.

@@ -118,12 +118,12 @@ class CheckpointWriter:
 
 
 def checkpoint_steps(folder: Path) -> list[int]:
-    """Returns the views after which a state is stored, oldest first."""
+    """Lists the views after which a state is stored, oldest first."""
     return [int(path.name) for path in numbered(folder)]
 
 
 def load_checkpoint(folder: Path, step: int) -> dict[str, dict[str, np.ndarray]]:
-    """Returns the tables that were stored after view `step`.
+    """Reads the tables that were stored after view `step`.
 
     Raises:
         RunError: it is not there, damaged, or it cannot be read.
@@ -164,7 +164,7 @@ def from_storable(table: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def read_checkpoint(folder: Path) -> tuple[int, MapState, OccupancyGrid]:
-    """Returns the newest stored map and grid, and the view after which they were stored.
+    """Reads the newest stored map and grid, and the view after which they were stored.
 
     Raises:
         RunError: there is none, or it cannot be read.
@@ -191,14 +191,14 @@ def map_tables(map_state: MapState, grid: OccupancyGrid) -> dict[str, dict[str, 
 
 
 def state_tables(state: LoopState) -> dict[str, dict[str, np.ndarray]]:
-    """Returns the state as a checkpoint holds it."""
+    """Returns the tables that a checkpoint of the state contains."""
     tables = map_tables(state.map_state, state.grid)
     tables["policy"] = named_arrays(state.policy_state)
     return tables | {"loop": {name: np.asarray(getattr(state, name)) for name in _LOOP}}
 
 
 def newest_state(folder: Path, rows: Sequence[StepRow], start: LoopState) -> LoopState:
-    """Returns the newest stored state that can be used; the start if there is none.
+    """Reads the newest stored state that can be used; returns the start if there is none.
 
     Args:
         folder: of the checkpoints.
@@ -227,7 +227,7 @@ def newest_state(folder: Path, rows: Sequence[StepRow], start: LoopState) -> Loo
 
 
 def state_of(tables: Tables, like: LoopState) -> LoopState:
-    """Returns the inverse of `state_tables`.
+    """Restores a state from the tables of `state_tables`.
 
     Args:
         tables: of a checkpoint.
@@ -263,7 +263,7 @@ def named_arrays(tree: Any) -> dict[str, np.ndarray]:
 
 
 def fill(template: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    """Returns a tree built like `template` whose leaves are `arrays`: inverse of `named_arrays`.
+    """Fills a tree built like `template` with the leaves `arrays`: the inverse of `named_arrays`.
 
     Shapes may differ from the template's, as tables grow; types may not.
 
@@ -291,10 +291,7 @@ def _name(path: tuple[Any, ...]) -> str:
 
 
 def _like(leaf: Any, array: np.ndarray, name: str) -> Any:
-    """Returns the array as the kind of thing that the leaf is.
-
-    A device array, NumPy, or a number.
-    """
+    """Converts the array to the kind of the leaf: a device array, NumPy, or a number."""
     wanted = np.asarray(leaf)
     # Sizes may differ, as tables double; a type or an axis may not, as compiled code rests on them.
     if array.dtype != wanted.dtype or array.ndim != wanted.ndim:

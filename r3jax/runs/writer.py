@@ -338,7 +338,7 @@ def _named(path: Path, what: str) -> Generator[None]:
 
 
 def encode_png(image: np.ndarray) -> bytes:
-    """Returns a PNG of [H, W, 3] uint8 or [H, W] uint16."""
+    """Encodes an image, [H, W, 3] uint8 or [H, W] uint16, as PNG."""
     from PIL import Image  # a run is read without images more often than with them
 
     buffer = io.BytesIO()

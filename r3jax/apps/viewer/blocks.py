@@ -300,7 +300,7 @@ class Known:
 def known_at(
     moment: Moment, camera: Camera, config: ScoringConfig, budget: int, *, with_terms: bool = True
 ) -> Known:
-    """Returns the blocks of a moment's map, and what cameras in known free space think of them.
+    """Groups a moment's map into blocks, and scores its voxels from known free space.
 
     Args:
         moment: the moment.
@@ -324,13 +324,13 @@ def scoring_of(header: RunHeader) -> ScoringConfig:
 
 
 def title_of(header: RunHeader) -> str:
-    """Returns the who explored what, in a few words; a file's name without its folders."""
+    """Names a run by its policy and its scene; of a file, without its folders."""
     scene = str(header.scene.get("name", "")).rpartition("/")[2]
     return f"{header.policy.get('name', '')} in {scene}"
 
 
 def cut_height(rows: Sequence[StepRow], points: np.ndarray) -> float:
-    """Returns the height above which nothing is drawn, so that one looks in from above [m].
+    """Returns the height [m] above which nothing is drawn, so that the place is open from above.
 
     Args:
         rows: of the trace, at least one: the cameras stay in view.

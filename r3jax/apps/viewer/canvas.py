@@ -280,7 +280,7 @@ class Canvas:
 
 
 def framing(points: np.ndarray, aspect: float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns where to look from and to [m], so that points [n, 3] [m] fill a window.
+    """Returns a position and a target [m] from which points [n, 3] [m] fill a window.
 
     Args:
         points: what is to be in view.

@@ -35,7 +35,7 @@ CAUSE_COLORS = tuple(to_bytes(np.asarray(to_rgb(color))) for color in style.CAUS
 
 @functools.cache
 def _table(name: str) -> np.ndarray:
-    """Returns 256 colors, [256, 3] uint8."""
+    """Returns the 256 colors of a colormap, [256, 3] uint8."""
     colors = matplotlib.colormaps[name](np.linspace(0.0, 1.0, 256))[:, :3]
     table = np.rint(colors * 255.0).astype(np.uint8)
     table.flags.writeable = False
@@ -43,7 +43,7 @@ def _table(name: str) -> np.ndarray:
 
 
 def paint(values: np.ndarray, name: str = SCORES) -> np.ndarray:
-    """Returns colors of numbers in [0, 1]; NaN becomes `UNSEEN`.
+    """Colors numbers in [0, 1]; NaN becomes `UNSEEN`.
 
     Args:
         values: [...]; what lies outside [0, 1] gets the color of the nearer end.
@@ -58,23 +58,20 @@ def paint(values: np.ndarray, name: str = SCORES) -> np.ndarray:
 
 
 def linear_light(encoded: np.ndarray) -> np.ndarray:
-    """Returns the light of sRGB-encoded colors, both [..., 3] in [0, 1].
-
-    What some renderers ask for.
-    """
+    """Converts sRGB-encoded colors to linear light, both [..., 3] in [0, 1]."""
     low = encoded / 12.92
     return np.where(encoded <= 0.04045, low, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
 def css_color(color: np.ndarray | tuple[int, int, int]) -> str:
-    """Returns a color of three bytes as browsers write it, such as `#0f766e`."""
+    """Writes a color of three bytes in the form of CSS, such as `#0f766e`."""
     return "#" + "".join(f"{int(part):02x}" for part in color)
 
 
 def spread(values: np.ndarray) -> np.ndarray:
-    """Returns numbers shifted and scaled to [0, 1].
+    """Shifts and scales numbers to [0, 1].
 
-    Equal ones become 0.5, what is not finite NaN.
+    If all are equal, they become 0.5. Numbers that are not finite become NaN.
     """
     values = np.asarray(values, dtype=np.float64)
     finite = np.isfinite(values)

@@ -122,9 +122,7 @@ LAYERS = (
 
 
 def menu_of(surfaces: tuple[str, ...], *, with_causes: bool) -> tuple[Layer, ...]:
-    """Returns the entries of a menu, the first to be opened on.
-
-    Splats if there are any, else colors.
+    """Returns the entries of a menu, the initial one first: splats if there are any, else colors.
 
     Args:
         surfaces: what there is to draw.
@@ -152,19 +150,19 @@ def _part(macro: str, **values: Any) -> str:
 
 
 def head_html(text: str) -> str:
-    """Returns the line below the title."""
+    """Formats the line below the title."""
     return _part("head", text=text)
 
 
 def note_html(text: str) -> str:
-    """Returns a line about what went wrong, or is missing."""
+    """Formats a note about an error, or about something missing."""
     return _part("note", text=text)
 
 
 def view_html(
     row: StepRow, num_views: int, image: np.ndarray, reason: Reason | str, unit: str = "view"
 ) -> str:
-    """Returns the photo of a view, what the trace says of it, and why it was chosen.
+    """Formats the photo of a view, its facts from the trace, and why it was chosen.
 
     Args:
         row: of the trace.
@@ -189,7 +187,7 @@ def view_html(
 
 
 def facts_of_view(row: StepRow) -> dict[str, str]:
-    """Returns what the trace says of a view."""
+    """Returns the facts that the trace contains about a view."""
     return {
         "mission clock": f"{row.seconds:.1f} s",
         "this view cost": f"{sum(row.charged.values()):.1f} s",
@@ -201,7 +199,7 @@ def facts_of_view(row: StepRow) -> dict[str, str]:
 
 
 def best_candidates(choice: Choice) -> list[dict[str, Any]]:
-    """Returns the best candidates of a decision in words."""
+    """Describes the best candidates of a decision."""
     chosen = chosen_rank(choice)
     lines: list[dict[str, Any]] = []
     for rank in range(min(len(choice.top.get("total", [])), _SHOWN)):
@@ -224,7 +222,7 @@ def best_candidates(choice: Choice) -> list[dict[str, Any]]:
 
 
 def chosen_rank(choice: Choice) -> int | None:
-    """Returns which of the best candidates was taken, from 0; None if it is not among them."""
+    """Finds the chosen view among the best candidates, from 0; None if it is not among them."""
     for rank, total in enumerate(choice.top.get("total", [])):
         if total is not None and math.isclose(total, choice.score, rel_tol=1e-5, abs_tol=1e-12):
             return rank
@@ -245,7 +243,7 @@ def _ordinal(number: int) -> str:
 
 
 def promise_of(reason: Reason | str) -> dict[str, Any] | str:
-    """Returns what a view promised when it was chosen, by cause; or why that is not known."""
+    """Describes what a view promised when it was chosen, by cause, or why that is not known."""
     if isinstance(reason, str):
         return reason
     total = reason.utility
@@ -267,12 +265,12 @@ def _count(number: int, name: str) -> str:
 
 
 def pending_html() -> str:
-    """Returns the before the first numbers."""
+    """Formats the placeholder before the first numbers."""
     return _part("pending")
 
 
 def stale_html(content: str, text: str = "") -> str:
-    """Returns what belongs to another pose or view, faint, below what is going on.
+    """Shows content of another pose or view faintly, below a note on the current computation.
 
     Args:
         content: from this module.
@@ -283,7 +281,7 @@ def stale_html(content: str, text: str = "") -> str:
 
 
 def preview_html(glance: QuickPreview, look: CameraPreview | None, view: int) -> str:
-    """Returns R of the dragged camera, its terms, and the utility of looking there.
+    """Formats R of the dragged camera, its terms, and the utility of its directions.
 
     Args:
         glance: what takes milliseconds.
@@ -307,7 +305,7 @@ def preview_html(glance: QuickPreview, look: CameraPreview | None, view: int) ->
 
 
 def pictures_html(pictures: Sequence[tuple[str, np.ndarray]], panorama: np.ndarray) -> str:
-    """Returns the dragged camera's pictures and its panorama, each with its name.
+    """Formats the dragged camera's pictures and its panorama, each with its name.
 
     Args:
         pictures: names and pictures, [H, W, 3] uint8 each.
@@ -323,19 +321,19 @@ def pictures_html(pictures: Sequence[tuple[str, np.ndarray]], panorama: np.ndarr
 
 
 def _picture(image: np.ndarray) -> dict[str, Any]:
-    """Returns a picture [H, W, 3] uint8 for the template."""
+    """Prepares a picture [H, W, 3] uint8 for the template."""
     return {"url": image_url(image), "is_coarse": _is_coarse(image)}
 
 
 def image_url(image: np.ndarray) -> str:
-    """Returns a picture [H, W, 3] uint8 as an address that holds it."""
+    """Encodes a picture [H, W, 3] uint8 as a data URL."""
     file, kind = io.BytesIO(), "png" if _is_coarse(image) else "jpeg"
     Image.fromarray(np.ascontiguousarray(image)).save(file, kind, quality=88)
     return data_url(file.getvalue(), kind)
 
 
 def _is_coarse(picture: np.ndarray) -> bool:
-    """Returns the few pixels stay squares: they are measurements, no photo."""
+    """Returns True for a picture of few pixels, which stay squares: measurements, no photo."""
     return picture.shape[1] < _COARSE
 
 
@@ -369,7 +367,7 @@ class Caption:
 
 
 def legend_html(caption: Caption, with_candidates: bool = False) -> str:
-    """Returns the legend of what is drawn, of which moment, and what its colors mean.
+    """Formats the legend: the drawn layer, its moment, and the meaning of its colors.
 
     Args:
         caption: what is drawn.
@@ -398,14 +396,14 @@ def legend_html(caption: Caption, with_candidates: bool = False) -> str:
 
 
 def _bar(name: str, low: str, high: str, hint: str) -> dict[str, Any]:
-    """Returns a color map from left to right, and what its ends mean."""
+    """Returns a color map from left to right, and the meaning of its ends."""
     stops = [css_color(color) for color in paint(np.linspace(0.0, 1.0, _STOPS), name)]
     return {"hint": hint, "stops": stops, "low": low, "high": high}
 
 
 def busy_html(text: str, legend: str) -> str:
-    """Returns what is being computed, above the legend of what is drawn until then; "".
+    """Formats a note on the current computation, above the legend of what is drawn until then.
 
-    Nothing is yet.
+    The legend is empty if nothing is drawn yet.
     """
     return _part("busy", text=text, until_then=legend)

@@ -43,7 +43,7 @@ ENCODERS = ("libx264", "libopenh264", "h264_videotoolbox", "mpeg4")
 
 
 def load_av() -> ModuleType:
-    """Returns PyAV.
+    """Imports PyAV.
 
     Raises:
         ImportError: it is not installed; the message names the extra.
@@ -106,7 +106,7 @@ class Film:
         self._extent = np.concatenate([shown, positions]) if len(shown) else positions
 
     def still(self, quantity: str, *, from_above: bool) -> bytes:
-        """Returns the last map, PNG.
+        """Draws the last map as PNG.
 
         Args:
             quantity: one of `QUANTITIES`.
@@ -115,7 +115,7 @@ class Film:
         return self._drawn(self._last, quantity, -90.0, 90.0 if from_above else 48.0)
 
     def picture(self, step: int, quantity: str = "renderability") -> bytes:
-        """Returns the map after one view, PNG; the film goes round the place as views go by."""
+        """Draws the map after one view as PNG; the film circles the place as views go by."""
         share = step / max(len(self.run.rows) - 1, 1)
         return self._drawn(self._known(step), quantity, -90.0 + _TURN * (share - 0.5), 48.0)
 
@@ -190,7 +190,10 @@ class Film:
 
 
 def _view_axes(azimuth: float, elevation: float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the right and up of a picture [3, 2], and the direction towards the eye [3] [deg]."""
+    """Returns the right and up of a picture [3, 2], and the direction towards the eye [3].
+
+    Both angles are in degrees.
+    """
     a, e = np.deg2rad(azimuth), np.deg2rad(elevation)
     outward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     right = np.array([-np.sin(a), np.cos(a), 0.0])

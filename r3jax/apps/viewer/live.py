@@ -36,7 +36,7 @@ def open_live(
     subtitle: str,
     earlier: Run | None = None,
 ) -> "LiveFeed":
-    """Returns a page for an exploration that is about to begin.
+    """Opens a page for an exploration that is about to begin.
 
     Args:
         server: with an empty page; it stays the caller's.

@@ -24,7 +24,7 @@ SPLAT_BUDGET = 300_000
 
 
 def path_segments(rows: Sequence[StepRow], num_views: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the path that the camera flew, segment by segment.
+    """Computes the path that the camera flew, segment by segment.
 
     Args:
         rows: of the trace from the first one on, as many as are to be drawn.
@@ -131,12 +131,12 @@ def splat_arrays(
 
 
 def _matrices(wxyz: np.ndarray) -> np.ndarray:
-    """Returns the rotation matrices [..., 3, 3] of quaternions [..., 4] of any length but 0."""
+    """Converts quaternions [..., 4] of any length but 0 to rotation matrices [..., 3, 3]."""
     return Rotation.from_quat(wxyz, scalar_first=True).as_matrix()
 
 
 def quaternion(R: np.ndarray) -> tuple[float, float, float, float]:
-    """Returns the unit quaternion wxyz of a rotation matrix [3, 3], w >= 0."""
+    """Converts a rotation matrix [3, 3] to the unit quaternion wxyz, w >= 0."""
     w, x, y, z = Rotation.from_matrix(R).as_quat(canonical=True, scalar_first=True).tolist()
     return w, x, y, z
 

@@ -103,7 +103,7 @@ class CameraPreview:
 
 
 def quick_preview_from(around: Context, T_world_camera: np.ndarray) -> QuickPreview:
-    """Returns R and its terms in the view at one pose [4, 4]."""
+    """Computes R and its terms in the view at one pose [4, 4]."""
     pose = jnp.asarray(T_world_camera, dtype=jnp.float32)
     shown = term_images(around.map_state, around.camera, pose, around.config)
     is_hit = np.asarray(shown.row) < around.map_state.capacity
@@ -119,7 +119,7 @@ def quick_preview_from(around: Context, T_world_camera: np.ndarray) -> QuickPrev
 def preview_from(
     around: Context, T_world_camera: np.ndarray, glance: QuickPreview | None = None
 ) -> CameraPreview:
-    """Returns everything about the view at one pose.
+    """Computes everything about the view at one pose.
 
     Args:
         around: map, grid, camera and what else is known.
@@ -174,7 +174,7 @@ def _bin_of_pixel(width: int, num_bins: int) -> np.ndarray:
 
 
 def panorama_pixel(direction: np.ndarray, width: int) -> tuple[float, float]:
-    """Returns where a direction lies in a panorama of that width: column and row [px]."""
+    """Projects a direction into a panorama of that width: column and row [px]."""
     x, y, z = direction / np.linalg.norm(direction)
     column = (np.pi - np.arctan2(y, x)) / (2.0 * np.pi) * width
     row = (0.5 * np.pi - np.arcsin(np.clip(z, -1.0, 1.0))) / np.pi * (width // 2)
@@ -205,7 +205,7 @@ def panorama_image(look: CameraPreview, width: int = 360) -> np.ndarray:
 
 
 def quick_preview_image(glance: QuickPreview, term: str) -> np.ndarray:
-    """Returns R or a term, pixel by pixel, [h, w, 3] uint8."""
+    """Draws R or a term, pixel by pixel, [h, w, 3] uint8."""
     return paint(glance.images[term])
 
 

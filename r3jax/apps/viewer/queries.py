@@ -132,7 +132,7 @@ class PlaceLayer:
         moment: Moment,
         reason: Reason | str,
     ) -> bool:
-        """Returns whether `draw` would draw what is drawn already."""
+        """Returns True if `draw` would draw what is drawn already."""
         return self._drawn == _key(settings, T_world_camera, moment.step, reason)
 
     def draw(
@@ -142,7 +142,7 @@ class PlaceLayer:
         moment: Moment,
         reason: Reason | str,
     ) -> Show:
-        """Returns what is wished for.
+        """Computes the drawing that the settings select, if it is not there yet.
 
         Args:
             settings: of the user.
@@ -179,7 +179,7 @@ class PlaceLayer:
         return show
 
     def _voxels(self, settings: DisplaySettings, position: np.ndarray, moment: Moment) -> _Drawing:
-        """Returns the map, colored as wished and cut open."""
+        """Draws the map, colored by the chosen quantity and cut open."""
         has_score = settings.layer.has_score
         from_free_space = settings.place == PLACES[0]
         known = self._known_at(moment, with_terms=has_score and from_free_space)
@@ -195,9 +195,9 @@ class PlaceLayer:
         return self._blocks(blocks, colors, settings.cut, self._after(moment.step), detail)
 
     def _causes(self, cut: float, moment: Moment, reason: Reason | str) -> _Drawing:
-        """Returns the map that a view was chosen on, by what the view was after.
+        """Draws the map that a view was chosen on, colored by the causes of its utility.
 
-        Gray if unknown.
+        The map is gray if these are not known.
         """
         is_known = isinstance(reason, Reason)
         before = self._story.moment(moment.step - 1) if is_known else moment
@@ -239,7 +239,7 @@ class PlaceLayer:
         return known
 
     def _recorded(self, cut: float) -> _Drawing:
-        """Returns the measured points, cut open."""
+        """Draws the measured points, cut open."""
         if self._points is None:
             assert self._sources.points is not None
             self._points = self._sources.points()
@@ -251,7 +251,7 @@ class PlaceLayer:
         return _Drawing(show, _WHOLE, f"{len(points):,} points, as many from each view")
 
     def _splats(self, cut: float) -> _Drawing:
-        """Returns the trained splats, cut open."""
+        """Draws the trained splats, cut open."""
         model = self._sources.model
         assert model is not None
         if self._gaussians is None:
@@ -266,7 +266,7 @@ class PlaceLayer:
         return _Drawing(show, _WHOLE, f"{share} Gaussians in their mean colors")
 
     def _mesh(self, cut: float) -> _Drawing:
-        """Returns the scene's own triangles, but for those above the cut."""
+        """Draws the scene's own triangles below the cut."""
         assert self._sources.mesh is not None
         glb = self._sources.mesh(cut)
         show = functools.partial(self._canvas.show_mesh, "/mesh", glb)
@@ -279,7 +279,7 @@ _WHOLE = "of the whole run"
 def _key(
     settings: DisplaySettings, T_world_camera: np.ndarray, step: int, reason: Reason | str
 ) -> tuple[object, ...]:
-    """Returns what a drawing depends on: equal keys, equal drawings."""
+    """Returns everything that a drawing depends on: equal keys, equal drawings."""
     layer = settings.layer
     key: tuple[object, ...] = (layer, settings.cut)
     if not layer.is_of_one_view:
@@ -295,7 +295,7 @@ def _key(
 
 
 def voxel_note(blocks: Blocks) -> str:
-    """Returns how many voxels are drawn, and how."""
+    """Describes how many voxels are drawn, and in blocks of which size."""
     if blocks.num_voxels == len(blocks.centers):
         return f"{blocks.num_voxels:,} voxels of {100 * blocks.edge:.3g}\u00a0cm"
     return (
@@ -404,7 +404,7 @@ class QueryHandler:
             self._deciding.join()
 
     def prepare(self) -> bool:
-        """Returns something for later, while nothing is asked."""
+        """Prepares for later questions while the page is idle; returns False when done."""
         try:
             return self._story.advance()
         except RunError as error:
@@ -419,10 +419,7 @@ class QueryHandler:
                 self._ask_again()
 
     def work(self, question: Query) -> Iterator[Show]:
-        """Yields the parts of the answer to a question.
-
-        What is quick, and what is looked at, first.
-        """
+        """Yields the parts of the answer to a question, the quick and visible ones first."""
         settings, pose = question.settings, question.T_world_camera
         step = min(settings.step, len(self._story.rows) - 1)
         reason = self._story.reason(step)
@@ -447,7 +444,7 @@ class QueryHandler:
     def _draw(
         self, settings: DisplaySettings, pose: np.ndarray, moment: Moment, reason: Reason | str
     ) -> Iterator[Show]:
-        """Yields the place and what it shows in words, unless it is there already."""
+        """Draws the place and its legend, unless they are there already."""
         if self._place.is_drawn(settings, pose, moment, reason):
             return
         text = f"View {settings.step + 1}: drawing {settings.layer.name}"
@@ -524,7 +521,7 @@ class QueryHandler:
         self.look = look
 
     def _show_pictures(self, look: CameraPreview, settings: DisplaySettings) -> Show:
-        """Returns what the camera would see, beside the true image if that is wanted."""
+        """Prepares what the camera would see, beside the true image if that is selected."""
         photographer, quantity = self._extras.photographer, settings.layer.quantity
         if settings.shows_truth and photographer is not None:
             look = replace(look, truth=photographer(look.T_world_camera))
@@ -538,7 +535,7 @@ class QueryHandler:
             self._controls.show_legend(legend_html(self._place.caption, has_candidates))
 
     def _show_candidates(self, step: int, is_wanted: bool) -> Show:
-        """Returns the candidates of a view, colored by score, and the legend; all is shown then."""
+        """Prepares the candidates of a view, colored by score, and the legend."""
         segments, colors = np.zeros((0, 2, 3), np.float32), np.zeros((0, 2, 3), np.uint8)
         if is_wanted:
             offer = self._story.offer(step) or self._offers.get(step)
@@ -592,7 +589,7 @@ class QueryHandler:
 
 
 def floor_height(heights: np.ndarray, voxel_size: float) -> float:
-    """Returns the height of the floor [m]: the lower side of the lowest layer that is well filled.
+    """Estimates the height of the floor [m]: the lower side of the lowest well-filled layer.
 
     Args:
         heights: centers of voxels, [n] [m].
@@ -604,6 +601,6 @@ def floor_height(heights: np.ndarray, voxel_size: float) -> float:
 
 
 def _color_of(glance: QuickPreview) -> Color:
-    """Returns the color of R, darker than the map's, so that lines stand out before it."""
+    """Returns the color of R, darker than the map's, so that lines stand out against it."""
     red, green, blue = paint(np.asarray([glance.renderability]))[0].tolist()
     return round(0.7 * red), round(0.7 * green), round(0.7 * blue)

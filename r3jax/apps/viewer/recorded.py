@@ -185,7 +185,7 @@ def open_run_page(
 
 
 def _summary(run: Run) -> str:
-    """Returns where a run lies, how long it is and how it ended."""
+    """Describes where a run is stored, how long it is and how it ended."""
     last, end = run.rows[-1], run.end
     is_used_up = end is not None and end.outcome == "budget"
     ended = "budget used up" if is_used_up else run.outcome
@@ -198,7 +198,7 @@ def _decisions(run: Run) -> Iterator[tuple[int, Offer | None]]:
 
 
 def _splats(run: Run, name: str | None) -> tuple[GaussianScene, tuple[float, float, float]] | None:
-    """Returns the model of that name, and the background that it was trained with."""
+    """Reads the model of that name, or the newest, and the background that it was trained with."""
     name = name or newest_name(run.path / "models")
     if name is None:
         return None
@@ -217,13 +217,13 @@ class RecordedScene:
         """Why it cannot be opened, once that is known."""
 
     def photograph(self, T_world_camera: np.ndarray) -> np.ndarray | None:
-        """Returns the true picture at a pose, [H, W, 3]; None if the scene cannot be opened."""
+        """Renders the true picture at a pose, [H, W, 3], or None if the scene cannot be opened."""
         if self._simulator is None:
             return None
         return np.asarray(self._simulator.render(T_world_camera).rgb)
 
     def mesh(self, top: float) -> bytes:
-        """Returns the triangles as GLB, without what lies above a height [m].
+        """Exports the triangles as GLB, without those above a height [m].
 
         Raises:
             ValueError: the scene cannot be opened, or is too large to be shown.

@@ -75,7 +75,7 @@ class _Guard:
         self._names = self._allowed | {_bare(name) for name in (*own, *LOOPBACK)}
 
     def refusal(self, request: Request) -> str | None:
-        """Returns why a request is not answered, or None."""
+        """Returns why a request is refused, or None if it is allowed."""
         hosts = request.headers.get_all("Host")
         origins = request.headers.get_all("Origin")
         if len(hosts) != 1 or len(origins) > 1:
@@ -106,7 +106,7 @@ def _bare(name: str) -> str:
 
 
 def _name(url: str) -> str:
-    """Returns the machine of an address, without its port; empty if there is none."""
+    """Returns the host name of a URL, without its port; empty if there is none."""
     try:
         return _bare(urlsplit(url).hostname or "")
     except ValueError:
@@ -157,11 +157,11 @@ def close_server(server: viser.ViserServer) -> None:
 
 
 def url_of(server: viser.ViserServer) -> str:
-    """Returns where a browser on this machine finds the page."""
+    """Returns the URL of the page for a browser on this machine."""
     host = _reachable(server)
     return f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}"
 
 
 def _reachable(server: viser.ViserServer) -> str:
-    """Returns an address of this machine that the server listens at."""
+    """Returns an address of this machine that the server listens on."""
     return {"0.0.0.0": "127.0.0.1", "::": "127.0.0.1"}.get(server.get_host(), server.get_host())

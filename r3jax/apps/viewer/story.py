@@ -53,7 +53,7 @@ class Offer:
 
 
 def offer_of(decision: Decision) -> Offer:
-    """Returns the candidates of a decision."""
+    """Returns the candidates of a decision, and which of them was chosen."""
     gap = np.abs(decision.candidates - decision.T_world_camera).max(axis=(1, 2))
     return Offer(decision.candidates, decision.utilities, int(np.argmin(gap)))
 
@@ -101,7 +101,9 @@ class _RecordedWorld:
 def decide_again(
     run: Run, policy: Policy, config: ExplorationConfig
 ) -> Iterator[tuple[int, Offer | None]]:
-    """Yields what was on offer at every view of a run, in order; takes as long as planning took.
+    """Repeats the decisions of a run and yields the candidates at every view, in order.
+
+    This takes as long as planning took.
 
     Args:
         run: the run, with at least one view; not a merged one.
@@ -167,7 +169,7 @@ class Moment:
 
 
 def why_no_choice(row: StepRow) -> str:
-    """Returns why no decision stands with a view."""
+    """Explains why no decision is recorded with a view."""
     if row.captured:
         return "captured while moving"
     if row.begins_run:
@@ -247,7 +249,7 @@ class Timeline:
         return max((m for m in known if m is not None and m.step <= step), key=lambda m: m.step)
 
     def _after(self, moment: Moment) -> Moment:
-        """Returns the state one view later."""
+        """Computes the state one view later, and stores it for later use."""
         config, frame = self._config, self.run.frame(moment.step + 1)
         after = Moment(moment.step + 1, *add_frame(moment.map_state, moment.grid, frame, config))
         if after.step % self.stride == 0:
@@ -258,10 +260,7 @@ class Timeline:
 
 
 def _stored(run: Run, grid: OccupancyGrid) -> Moment | None:
-    """Returns the last view's state from its checkpoint, so that it is there at once; None.
-
-    Replay.
-    """
+    """Reads the last view's state from its checkpoint; returns None if it must be replayed."""
     try:
         step, map_state, stored_grid = run.checkpoint()
     except RunError:
@@ -313,7 +312,7 @@ class Story(Protocol):
         ...
 
     def moment(self, step: int) -> Moment:
-        """Returns what was known after a view; for the worker's thread only."""
+        """Returns the state after a view; for the worker's thread only."""
         ...
 
     def replay(self, step: int) -> Iterator[tuple[int, int]]:
@@ -325,7 +324,7 @@ class Story(Protocol):
         ...
 
     def offer(self, step: int) -> Offer | None:
-        """Returns the candidates that a view was chosen from; None if they are not known."""
+        """Returns the candidates that a view was chosen from, or None if they are not known."""
         ...
 
     def reason(self, step: int) -> Reason | str:
@@ -368,7 +367,7 @@ class RecordedStory:
         return _recorded_image(self._run, step)
 
     def moment(self, step: int) -> Moment:
-        """Returns what was known after a view."""
+        """Returns the state after a view."""
         return self._timeline.at(step)
 
     def replay(self, step: int) -> Iterator[tuple[int, int]]:
@@ -391,9 +390,9 @@ class RecordedStory:
         return True
 
     def _explain(self) -> Iterator[Reason | None]:
-        """Returns the reasons of all views, in order.
+        """Replays the run and iterates over the reasons of all views, in order.
 
-        Nothing but the replay where others had a say.
+        Where decisions were not made on this map alone, all reasons are None.
         """
         moments = self._timeline.follow()
         if self._run.header.is_merged:
@@ -405,14 +404,14 @@ class RecordedStory:
         return explain_run(self._run, ((m.map_state, m.grid) for m in moments))
 
     def offer(self, step: int) -> Offer | None:
-        """Returns the trace does not keep the candidates."""
+        """Returns None: the trace does not contain the candidates."""
         del step
         return None
 
     def reason(self, step: int) -> Reason | str:
-        """Returns what a view promised when it was chosen.
+        """Returns what a view promised when it was chosen, or why that is not known.
 
-        Known once the views before are replayed.
+        It is known once the views before have been replayed.
         """
         if self._run.rows[step].choice is None:
             return why_no_choice(self._run.rows[step])
@@ -479,7 +478,7 @@ class LiveStory:
         return _recorded_image(self._earlier, step)
 
     def moment(self, step: int) -> Moment:
-        """Returns what is known now: earlier maps are not kept.
+        """Returns the current state: earlier maps are not stored.
 
         Raises:
             LookupError: before the first view.
@@ -490,12 +489,12 @@ class LiveStory:
         return self._moment
 
     def replay(self, step: int) -> Iterator[tuple[int, int]]:
-        """Returns the there is nothing to replay: the newest state is at hand."""
+        """Returns an empty iterator: the current state needs no replay."""
         del step
         return iter(())
 
     def advance(self) -> bool:
-        """Returns the there is nothing to prepare."""
+        """Returns False: there is nothing to prepare."""
         return False
 
     def offer(self, step: int) -> Offer | None:
@@ -503,7 +502,7 @@ class LiveStory:
         return self._offers.get(step)
 
     def reason(self, step: int) -> Reason | str:
-        """Returns the map that a view was chosen on is not kept."""
+        """Returns a text instead of a reason: the map that a view was chosen on is not stored."""
         del step
         return "known once the run is over and opened by `r3jax view`"
 

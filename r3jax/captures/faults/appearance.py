@@ -92,9 +92,10 @@ many blocks."""
 def _leveled(
     images: Sequence[BlockImage], pairs: Sequence[Overlap], ratios_of: _Ratios, columns: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns pairs that could be compared [k, 2], in how many blocks [k].
+    """Levels all frames by the ratios between pairs.
 
-    Levels of every frame [n, c].
+    Returns the pairs that could be compared [k, 2], the number of their blocks [k], and the levels
+    of every frame [n, c].
     """
     found = [(o.first, o.second, *ratios_of(images, o)) for o in pairs]
     found = [row for row in found if np.isfinite(row[2]).all()]
@@ -106,11 +107,9 @@ def _leveled(
 
 
 def _detail_ratios(images: Sequence[BlockImage], pair: Overlap) -> tuple[np.ndarray, int]:
-    """Returns the median log-ratios of detail, all directions together and each, [5].
+    """Computes the median log-ratios of detail, all directions together and each, [5].
 
-    And of how many blocks.
-
-    NaN where too few blocks can be compared.
+    Also returns the number of blocks. The ratios are NaN where too few blocks can be compared.
     """
     first, second = images[pair.first], images[pair.second]
     own, other = pair.own[pair.agrees], pair.other[pair.agrees]
@@ -137,21 +136,21 @@ def _detail_ratios(images: Sequence[BlockImage], pair: Overlap) -> tuple[np.ndar
 
 
 def _noise(image: BlockImage) -> np.ndarray:
-    """Returns the detail of the plainest blocks in each direction, [4]: noise of the sensor."""
+    """Estimates the sensor's noise: the detail of the plainest blocks in each direction, [4]."""
     return np.percentile(image.detail, _PLAIN, axis=0)
 
 
 def _directions(image: BlockImage, blocks: np.ndarray) -> np.ndarray:
-    """Returns the unit directions in which a frame sees some of its blocks, [m, 3]."""
+    """Computes the unit directions in which a frame sees some of its blocks, [m, 3]."""
     offset = image.points[blocks] - image.pose[:3, 3]
     return offset / np.linalg.norm(offset, axis=1, keepdims=True)
 
 
 def image_motion(images: Sequence[BlockImage]) -> np.ndarray:
-    """Returns how far the image moved from one frame to the next, [n] [share of the image's width].
+    """Computes the motion of the image between frames, [n] [share of the image's width].
 
     A turn by an angle moves it by the focal length times as much; a step by that over the depth.
-    The larger of before and after; 0 of a single frame.
+    Each frame has the larger of the motions before and after it; a single frame has 0.
     """
     speed = np.zeros(len(images))
     for i, (a, b) in enumerate(pairwise(images)):
@@ -180,7 +179,7 @@ class Light:
     """Logarithms of red and of blue over green, [n, 2]; NaN: not compared."""
 
     def change(self, values: np.ndarray) -> np.ndarray:
-        """Returns values [n] beside the median of the neighbors', [n]; NaN: not compared."""
+        """Compares each value [n] with the median of its neighbors, [n]; NaN if it has none."""
         change = np.full(len(values), np.nan)
         for i, near in enumerate(neighbors_of(len(values), self.pairs)):
             if len(near):
@@ -196,9 +195,9 @@ def light(images: Sequence[BlockImage], pairs: Sequence[Overlap]) -> Light:
 
 
 def _light_ratios(images: Sequence[BlockImage], pair: Overlap) -> tuple[np.ndarray, int]:
-    """Returns the median log-ratios of brightness, red over green and blue over green, [3].
+    """Computes the median log-ratios of brightness, red over green and blue over green, [3].
 
-    Of how many.
+    Also returns the number of blocks that they are computed from.
     """
     own, other = pair.own[pair.agrees], pair.other[pair.agrees]
     a, b = images[pair.first].color[own], images[pair.second].color[other]
@@ -219,10 +218,7 @@ _DIFFERS = 4.0
 
 
 def repeats(images: Sequence[BlockImage]) -> list[list[int]]:
-    """Returns groups of frames that repeat each other, each in order, the largest first.
-
-    Every frame of a group repeats its first one: a slow pan is no chain of repetitions.
-    """
+    """Groups frames that repeat each other, each group in order, the largest first."""
     place = np.stack([image.pose[:3, 3] for image in images])
     groups: list[list[int]] = []
     grouped = np.zeros(len(images), dtype=bool)

@@ -115,7 +115,7 @@ def block_image(rgb: np.ndarray, depth: np.ndarray, camera: Camera, pose: np.nda
 
 
 def _cut(image: np.ndarray, side: int) -> np.ndarray:
-    """Returns the pixels of each block of an image [H, W, c], [b, side * side, c]."""
+    """Cuts an image [H, W, c] into the pixels of its blocks, [b, side * side, c]."""
     h, w = image.shape[0] // side, image.shape[1] // side
     parts = image[: h * side, : w * side].reshape(h, side, w, side, -1)
     return parts.swapaxes(1, 2).reshape(h * w, side * side, -1)
@@ -134,14 +134,14 @@ def _second_differences(image: np.ndarray) -> np.ndarray:
 
 
 def _contrast(mean: np.ndarray, blocks: Camera) -> np.ndarray:
-    """Returns the standard deviation of the blocks' brightness [b] among 3x3 of them, [b]."""
+    """Computes the standard deviation of the blocks' brightness [b] over 3x3 blocks, [b]."""
     padded = np.pad(mean.reshape(blocks.height, blocks.width), 1, mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
     return windows.std(axis=(2, 3)).ravel().astype(np.float32)
 
 
 def _one_depth(depth: np.ndarray) -> np.ndarray:
-    """Returns the mean depth of blocks [b, p, 1] that show one surface, [b]; NaN for the others."""
+    """Computes the mean depth of blocks [b, p, 1] that show one surface, [b], else NaN."""
     known = (depth[..., 0] > 0.0) & np.isfinite(depth[..., 0])
     values = np.where(known, depth[..., 0], 0.0)
     count = known.sum(axis=1)
@@ -200,11 +200,7 @@ class Overlap:
 
 
 def neighbor_pairs(images: Sequence[BlockImage]) -> np.ndarray:
-    """Returns pairs of frames (first < second) that may show the same surface, [k, 2].
-
-    Distances count in median depths, angles in radians: a step to the side as long as the
-    surface is away changes as much as a turn by 57 degrees.
-    """
+    """Finds pairs of frames (first < second) that may show the same surface, [k, 2]."""
     count = len(images)
     place = np.stack([image.pose[:3, 3] for image in images])
     axis = np.stack([image.pose[:3, 2] for image in images])
@@ -241,7 +237,7 @@ def overlaps(images: Sequence[BlockImage]) -> list[Overlap]:
 
 
 def levels(count: int, pairs: np.ndarray, difference: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Returns one number for each frame from differences between pairs, by robust least squares.
+    """Solves for one number per frame from differences between pairs, by robust least squares.
 
     Minimizes the sum of w |x_first - x_second - d| (reweighted least squares). Only differences
     between frames that are linked mean anything.
@@ -270,6 +266,6 @@ def levels(count: int, pairs: np.ndarray, difference: np.ndarray, weight: np.nda
 
 
 def neighbors_of(count: int, pairs: np.ndarray) -> list[np.ndarray]:
-    """Returns the frames that each frame was compared with, n arrays."""
+    """Lists the frames that each frame was compared with, n arrays."""
     both = np.concatenate([pairs, pairs[:, ::-1]])
     return [both[both[:, 0] == i, 1] for i in range(count)]

@@ -161,7 +161,7 @@ def find_faults(
 
 
 def stray_finding(source: Source, strays: Sequence[int], chosen: np.ndarray) -> Finding:
-    """Returns the finding on images that are left out, as their poses have diverged.
+    """Reports the images that are left out because their poses have diverged.
 
     Args:
         source: the capture.
@@ -238,7 +238,7 @@ class _Names:
     unit: str
 
     def label(self, number: int) -> str:
-        """Returns the label of the frame with this number among those looked at."""
+        """Returns the label of a frame by its number among the checked frames."""
         return self.labels[int(self.chosen[number])]
 
     def finding(
@@ -250,7 +250,7 @@ class _Names:
         captions: Sequence[str],
         value: float,
     ) -> Finding:
-        """Returns a finding on some of the frames looked at."""
+        """Makes a finding about some of the checked frames."""
         frames = tuple(int(self.chosen[number]) for number in numbers)
         return Finding(kind, what, todo, frames, tuple(captions), value)
 
@@ -307,7 +307,7 @@ def _pictures(numbers: Sequence[int]) -> str:
 
 
 def _largest(lit: Light, values: np.ndarray) -> float:
-    """Returns the largest difference [log] between two frames that is believed, and no mirror's."""
+    """Returns the largest credible difference [log] between two frames, leaving out outliers."""
     if not len(lit.pairs):
         return 0.0
     differences = np.sort(np.abs(np.subtract(*values[lit.pairs.T])))[::-1]
@@ -466,5 +466,5 @@ def _repeat(images: Sequence[BlockImage], names: _Names) -> Finding | None:
 
 
 def _numbers(values: np.ndarray) -> list[float | None]:
-    """Returns numbers for JSON, which has no NaN."""
+    """Rounds numbers for JSON, which has no NaN."""
     return [round(float(v), 4) if np.isfinite(v) else None for v in values]

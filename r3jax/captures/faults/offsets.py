@@ -157,7 +157,7 @@ def offsets(images: Sequence[BlockImage], pairs: Sequence[Overlap]) -> Offsets:
 def _explained(
     count: int, matches: list[_Matches], motion: np.ndarray, typical: float
 ) -> np.ndarray:
-    """Returns which frames the motion explains, [n]: see `Offsets.is_explained`."""
+    """Returns a mask of the frames that the motion explains, [n]: see `Offsets.is_explained`."""
     before, after = ([list[np.ndarray]() for _ in range(count)] for _ in range(2))
     for match in matches:
         left = match.error + match.rows @ motion[[match.first, match.second]].ravel()
@@ -173,7 +173,7 @@ def _explained(
 
 
 def _normals(points: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Returns the unit normals of the surfaces, [b, 3], from the blocks beside; NaN at edges."""
+    """Computes the unit normals of the surfaces from neighboring blocks, [b, 3]; NaN at edges."""
     grid = points.reshape(*shape, 3)
     normal = np.full(grid.shape, np.nan)
     across = grid[1:-1, 2:] - grid[1:-1, :-2]
@@ -207,7 +207,7 @@ def _matched(
     centers: list[np.ndarray],
     shared: list[np.ndarray],
 ) -> _Matches:
-    """Returns the equations of one pair."""
+    """Builds the equations of one pair."""
     is_near = np.abs(pair.ratio - 1.0) < _GATE
     own, other = pair.own[is_near], pair.other[is_near]
     normal = normals[pair.second][other]
@@ -226,7 +226,7 @@ def _matched(
 
 
 def _solved(count: int, matches: list[_Matches]) -> np.ndarray:
-    """Returns the motion of each frame: translation and rotation, [n, 6]."""
+    """Solves for the motion of each frame: translation and rotation, [n, 6]."""
     scale = _scatter(np.concatenate([match.error for match in matches]))
     size = 6 * count
     own = np.stack([np.r_[6 * m.first + _SIX, 6 * m.second + _SIX] for m in matches])  # [k, 12]
@@ -246,7 +246,7 @@ def _solved(count: int, matches: list[_Matches]) -> np.ndarray:
 
 
 def _systematic(matches: list[_Matches]) -> Systematic | None:
-    """Returns the one of `SYSTEMATIC` that leaves the least, if it is large and well known."""
+    """Finds the one of `SYSTEMATIC` that explains most, or None if it is small or uncertain."""
     error = np.concatenate([match.error for match in matches])
     shared = np.concatenate([match.shared for match in matches])
     fits = [_fit(error, column) for column in shared.T]
@@ -264,7 +264,7 @@ def _systematic(matches: list[_Matches]) -> Systematic | None:
 
 
 def _fit(error: np.ndarray, moved: np.ndarray) -> tuple[float, float]:
-    """Returns how much of a move [m] takes errors [m] away, and its standard deviation."""
+    """Fits the multiple of a move [m] that cancels errors [m], and its standard deviation."""
     size = information = 0.0
     for _ in range(4 * _ROUNDS):
         left = error + size * moved
@@ -276,15 +276,15 @@ def _fit(error: np.ndarray, moved: np.ndarray) -> tuple[float, float]:
 
 
 def _scatter(errors: np.ndarray) -> float:
-    """Returns the standard deviation of errors without those that are off, from their median."""
+    """Estimates the standard deviation of errors from their median, robust against outliers."""
     return max(1.4826 * float(np.median(np.abs(errors))), 1e-4)
 
 
 def _weight(error: np.ndarray, scatter: float) -> np.ndarray:
-    """Returns Cauchy weights of matches."""
+    """Computes Cauchy weights of matches."""
     return 1.0 / (1.0 + (error / (2.0 * scatter)) ** 2) / scatter**2
 
 
 def _moved(motion: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """Returns how a motion [6] moves points at offsets [m, 3] from its center, [m, 3]."""
+    """Applies a motion [6] to points at offsets [m, 3] from its center: their shifts, [m, 3]."""
     return motion[:3] + np.cross(motion[3:], offset)

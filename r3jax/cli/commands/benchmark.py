@@ -124,9 +124,9 @@ def _write_site(console: Console, root: Path, folder: Path) -> int:
 
 
 def _read(options: BenchmarkOptions, path: Path) -> Submission:
-    """Returns a submission, its scene where the user has it.
+    """Reads a submission, with the scene at the user's location.
 
-    A mesh lies elsewhere on every machine.
+    Meshes are stored elsewhere on every machine.
     """
     submission = read_submission(path)
     if options.scenes == BenchmarkOptions.scenes:
@@ -135,7 +135,7 @@ def _read(options: BenchmarkOptions, path: Path) -> Submission:
 
 
 def _check_submissions(console: Console, options: BenchmarkOptions) -> int:
-    """Returns says of each file what is wrong with it, or how many frames are in order."""
+    """Reports for each file what is wrong with it, or how many frames are in order."""
     code = 0
     for path in options.submissions.submission:
         try:
@@ -158,7 +158,7 @@ def _check_submissions(console: Console, options: BenchmarkOptions) -> int:
 
 
 def _plan(options: BenchmarkOptions, on_stage: Callable[[str], None]) -> tuple[Cell, ...]:
-    """Returns the cells of the policies, or of the submissions."""
+    """Plans the cells of the policies, or of the submissions."""
     if not options.submissions.submission:
         return make_plan(_request(options), options.out, on_stage)
     conditions, snapshots = _judging(options), words(options.snapshots or "")
@@ -196,7 +196,7 @@ def _judging(options: BenchmarkOptions) -> Conditions:
 
 
 def _images_again(records: Sequence[dict[str, Any]]) -> list[str]:
-    """Returns whether the frames of submissions are, bit for bit, those that were seen there."""
+    """Reports how many images of each submission were rendered identically here."""
     lines: dict[str, None] = {}
     for record in records:
         if (told := record.get("submission")) is not None and told["known_images"]:
@@ -209,7 +209,7 @@ def _images_again(records: Sequence[dict[str, Any]]) -> list[str]:
 def beside(
     records: Sequence[dict[str, Any]], others: Sequence[dict[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Returns records with those of the same scenes and snapshots that were made on equal terms.
+    """Adds to records those of the same scenes and snapshots that were made on equal terms.
 
     Args:
         records: of submissions.

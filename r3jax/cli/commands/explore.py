@@ -105,7 +105,7 @@ def run_explore(options: ExploreOptions) -> int:
 
 
 def _open_page(options: PageOptions, stack: contextlib.ExitStack) -> Callable[[Expedition], Any]:
-    """Returns a server for a page that will show an expedition; the stack closes it.
+    """Opens a server for a page that will show an expedition; the stack closes it.
 
     Returns:
         Makes the `viewer.live.LiveFeed` of the expedition, once there is one.
@@ -136,7 +136,7 @@ def _open_page(options: PageOptions, stack: contextlib.ExitStack) -> Callable[[E
 
 
 def _expedition(options: ExploreOptions, console: Console) -> Expedition:
-    """Returns the run that the options ask for: resumed, forked or new."""
+    """Opens the run that the options describe: resumed, forked or new."""
     earlier, folder, until = options.earlier, options.folder, options.loop.until
     if earlier.resume is not None:
         with console.status(f"opening {earlier.resume} and its scene ..."):
@@ -299,7 +299,7 @@ def run_team(options: TeamOptions) -> int:
 
 
 def _crew(options: TeamOptions, console: Console, stack: contextlib.ExitStack) -> tuple[Path, Crew]:
-    """Returns the team that the options ask for, resumed or new, and its folder."""
+    """Opens the team that the options describe, resumed or new, and its folder."""
     if options.resume is not None:
         with console.status(f"opening {options.resume} and its scene ..."):
             crew = resume_team(options.resume, stack, options.budget)
@@ -350,7 +350,7 @@ def _conclude_team(console: Console, folder: Path, result: TeamResult) -> None:
 
 
 def _against_time(views: tuple[TeamView, ...]) -> list[str]:
-    """Returns what all knew together at the quarters of the mission."""
+    """Describes the common map at the quarters of the mission."""
     lines: list[str] = []
     for quarter in (0.25, 0.5, 0.75, 1.0):
         seen = [view for view in views if view.seconds <= quarter * views[-1].seconds]
