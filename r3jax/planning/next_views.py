@@ -25,6 +25,7 @@ from r3jax.mapping.occupancy import OccupancyGrid, a_grid, centers_on_host
 from r3jax.mapping.state import MapState, a_map
 from r3jax.planning.candidates import best_views, candidates_at, spread
 from r3jax.planning.config import PlannerConfig
+from r3jax.planning.lazy_greedy import renew_best
 from r3jax.planning.robot.explorable import mask_unexplorable
 from r3jax.planning.robot.travel import safe_cells
 from r3jax.scoring.batch import cache_positions_near, score_cached_near, score_views_near
@@ -169,23 +170,24 @@ def _lazy_greedy(
     is_new = np.ones(len(left), dtype=bool)
     taken: list[np.ndarray] = []
     utilities: list[float] = []
+
+    def renew(ids: np.ndarray) -> np.ndarray:
+        # One shape, so that renewing compiles once.
+        turned, values = score(voxels, cells, ids[np.arange(_AT_ONCE) % len(ids)])
+        poses[ids] = turned[: len(ids)]
+        return values[: len(ids)]
+
     while True:
-        best = int(np.argmax(np.where(left > 0, bound, -np.inf)))
-        # Bounds only fall, so a fresh one at the top beats all stale ones below it (Minoux 1978).
-        if not is_new[best]:
-            stale = np.flatnonzero(~is_new & (left > 0))
-            ids = stale[np.argsort(-bound[stale], kind="stable")][:_AT_ONCE]
-            # One shape, so that renewing compiles once.
-            padded = ids[np.arange(_AT_ONCE) % len(ids)]
-            turned, values = score(voxels, cells, padded)
-            poses[ids], bound[ids], is_new[ids] = turned[: len(ids)], values[: len(ids)], True
-            continue
+        best = renew_best(bound, is_new, renew, _AT_ONCE)
+        assert best is not None  # there are at least k candidates
         # A copy: the row is turned again when its bound is renewed.
         taken.append(poses[best].copy())
         utilities.append(float(bound[best]))
         if len(taken) == k:
             return NextViews(np.stack(taken), np.asarray(utilities))
         left[best] -= 1
+        if not left[best]:
+            bound[best] = -np.inf
         # A view was taken: every other score is a bound from here on.
         is_new[:] = False
         T = jnp.asarray(poses[best], dtype=jnp.float32)

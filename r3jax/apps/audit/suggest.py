@@ -51,6 +51,7 @@ from r3jax.mapping.config import MappingConfig
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import poses_along
+from r3jax.planning.lazy_greedy import renew_best
 from r3jax.planning.planner import Planner, decide
 from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo
 from r3jax.scoring.backend import rows_in_pixels
@@ -429,22 +430,11 @@ def _best(
 
     Returns None if no candidate gains enough.
     """
-    is_new = np.zeros(len(gains), dtype=bool)
-    while len(gains):
-        best = int(np.argmax(gains))
-        if gains[best] < _LEAST_GAIN:
-            return None
-        if is_new[best]:
-            return best
-        # All at first, then the few that may be best.
-        first = np.isinf(gains)
-        order = np.argsort(-np.where(is_new, -np.inf, gains), kind="stable")
-        asked = np.flatnonzero(first) if first.any() else order[:_BATCH]
-        gains[asked] = view_gains(
-            state, grid, task.demand, answers, task.camera, poses[asked], task.config
-        )
-        is_new[asked] = True
-    return None
+
+    def renew(ids: np.ndarray) -> np.ndarray:
+        return view_gains(state, grid, task.demand, answers, task.camera, poses[ids], task.config)
+
+    return renew_best(gains, np.zeros(len(gains), dtype=bool), renew, _BATCH, _LEAST_GAIN)
 
 
 class _Taken(NamedTuple):
