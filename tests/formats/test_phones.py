@@ -13,8 +13,9 @@ from r3jax.formats.errors import FormatError
 from r3jax.formats.phones import archives
 from r3jax.formats.phones.polycam import is_polycam, read_polycam
 from r3jax.formats.phones.record3d import read_record3d
-from r3jax.formats.phones.stray_scanner import Video, read_stray_scanner
+from r3jax.formats.phones.stray_scanner import read_stray_scanner
 from r3jax.formats.posed_images import PosedImages
+from r3jax.formats.video import Video
 from tests.apps.audit.room import SIZE, color_of
 from tests.formats import phones
 from tests.formats.phones import FACTOR, NUM, Y_UP_FROM_Z_UP, rays_of

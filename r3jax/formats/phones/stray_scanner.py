@@ -12,12 +12,8 @@ Columns are found by their names, and an empty field is not known.
 (https://github.com/StrayRobots/scanner)
 """
 
-import io
 import math
-from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import numpy as np
 
@@ -34,9 +30,9 @@ from r3jax.formats.phones.archives import (
 )
 from r3jax.formats.posed_images import PosedImages
 from r3jax.formats.poses import UP_Y, quaternion_pose, read_matrix
-from r3jax.validation.errors import ForeignFileError, why_not_imported
+from r3jax.formats.video import Video
+from r3jax.validation.errors import ForeignFileError
 from r3jax.validation.files import check_regular, plain_text
-from r3jax.validation.images import MAX_PIXELS
 
 _BEST = 2
 _POSE = ("frame", "x", "y", "z", "qx", "qy", "qz", "qw")
@@ -44,85 +40,6 @@ _INTRINSICS = ("fx", "fy", "cx", "cy")
 _VIDEO = "rgb.mp4"
 _MAX_VIDEO = 4 << 30
 """Size of a video in an archive, which is read as a whole [bytes]."""
-
-
-_AHEAD = 90
-"""Gap between requested frames up to which frames are decoded rather than skipped by a seek."""
-
-
-class Video:
-    """A video that is read frame by frame, fastest in order."""
-
-    def __init__(self, path: Path, source: Path | bytes):
-        """Opens it and counts its frames without decoding them.
-
-        Args:
-            path: its name, for messages.
-            source: the file, or what it holds.
-
-        Raises:
-            FormatError: PyAV is not installed, or this is no video.
-        """
-        self._path = path
-        self._av = _load_av(path)
-        opened = io.BytesIO(source) if isinstance(source, bytes) else str(source)
-        try:
-            self._container: Any = self._av.open(opened)
-            self._stream: Any = self._container.streams.video[0]
-            self.size: tuple[int, int] = self._stream.width, self._stream.height
-            times = [packet.pts for packet in self._container.demux(self._stream)]
-        except Exception as error:  # whatever FFmpeg says of what is no video
-            raise FormatError(path, f"the video cannot be read ({error!s:.200})") from None
-        if not 0 < self.size[0] * self.size[1] <= MAX_PIXELS:
-            raise FormatError(path, f"the video has {self.size[0]} x {self.size[1]} pixels")
-        self._times = sorted(time for time in times if time is not None)
-        self._next, self._frames = len(self._times), iter(())
-
-    def __len__(self) -> int:
-        """Returns the number of frames."""
-        return len(self._times)
-
-    def frame(self, number: int) -> np.ndarray:
-        """Decodes a frame, [H, W, 3] uint8.
-
-        Raises:
-            FormatError: there is none of this number, or the video is damaged.
-        """
-        if not 0 <= number < len(self._times):
-            raise FormatError(
-                self._path, f"the video has {len(self)} frames, none of number {number}"
-            )
-        if not self._next <= number < self._next + _AHEAD:
-            self._frames = self._from(number)
-        try:
-            for frame in self._frames:
-                if frame.pts is not None and frame.pts >= self._times[number]:
-                    self._next = number + 1
-                    return self._pixels(frame)
-        except FormatError:
-            raise
-        except Exception as error:
-            raise FormatError(self._path, f"frame {number} is damaged ({error!s:.200})") from None
-        raise FormatError(self._path, f"the video ends before frame {number}")
-
-    def _from(self, number: int) -> Iterator[Any]:
-        """Yields frames, from the last key frame before a frame on."""
-        self._container.seek(self._times[number], stream=self._stream)
-        yield from self._container.decode(self._stream)
-
-    def _pixels(self, frame: Any) -> np.ndarray:
-        if (frame.width, frame.height) != self.size:
-            raise FormatError(self._path, f"a frame has {frame.width} x {frame.height} pixels")
-        return frame.to_ndarray(format="rgb24")
-
-
-def _load_av(path: Path) -> ModuleType:
-    try:
-        import av
-    except ImportError as error:
-        reason = why_not_imported(error, "av", "videos are decoded by PyAV,", "phones")
-        raise FormatError(path, reason) from None
-    return av
 
 
 def is_stray_scanner(path: Path) -> bool:
@@ -173,7 +90,7 @@ def read_stray_scanner(path: Path | str) -> PosedImages:
 
 
 def _shot(archive: Archive, video: Video, row: np.ndarray, params: np.ndarray) -> Shot:
-    """Makes one frame of a row [8] of the table and its intrinsics [4]."""
+    """Returns one frame of a row [8] of the table and its intrinsics [4]."""
     number = int(row[0])
     if number != row[0] or number < 0:
         raise ForeignFileError(f"{row[0]:g} is no number of a frame")
@@ -188,7 +105,7 @@ def _shot(archive: Archive, video: Video, row: np.ndarray, params: np.ndarray) -
 
 
 def _video(archive: Archive) -> Video:
-    """Opens the video, from the disk if it lies there."""
+    """Returns the video, from the disk where it lies there."""
     name = archive.where(_VIDEO)
     if archive.zipped is not None:
         return Video(name, archive.read(_VIDEO, _MAX_VIDEO))
@@ -198,9 +115,7 @@ def _video(archive: Archive) -> Video:
 
 
 def _table(archive: Archive) -> tuple[np.ndarray, np.ndarray]:
-    """Reads odometry.csv: frame and pose [n, 8], and intrinsics [n, 4].
-
-    Unknown values are NaN.
+    """The columns of odometry.csv: frame and pose [n, 8], and intrinsics [n, 4]; NaN: not known.
 
     Raises:
         ForeignFileError: no such columns, no rows, or a field that is no number.
@@ -224,7 +139,7 @@ def _table(archive: Archive) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _number(word: str, which: str) -> float:
-    """Reads a field; NaN where it is empty."""
+    """Returns a field; NaN where it is empty."""
     try:
         value = float(word) if word else 0.0
     except ValueError:
@@ -235,7 +150,7 @@ def _number(word: str, which: str) -> float:
 
 
 def _camera_matrix(archive: Archive) -> np.ndarray:
-    """Reads fx, fy, cx, cy of all frames, [4]."""
+    """Returns fx, fy, cx, cy of all frames, [4]."""
     name = "camera_matrix.csv"
     K = read_matrix(archive.where(name), 3, 3, archive.read(name).replace(b",", b" "))
     return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
