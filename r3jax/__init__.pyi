@@ -6,6 +6,7 @@ from .apps.forecast.expected_error import (
     voxel_difficulty,
 )
 from .apps.forecast.forecast import is_done
+from .apps.select.select import select_frames
 from .evaluation.evaluate import Evaluation, evaluate
 from .exploration.loop import Result, explore
 from .frame import Frame
@@ -118,6 +119,7 @@ __all__ = [
     "renderability",
     "renderability_image",
     "save",
+    "select_frames",
     "soft_utility",
     "start",
     "view_utility",

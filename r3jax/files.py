@@ -19,7 +19,9 @@ from collections.abc import Callable, Generator, Iterable
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-Kind = Literal["run", "team", "model", "training", "audit", "benchmark", "cell", "site", "planner"]
+Kind = Literal[
+    "run", "team", "model", "training", "audit", "benchmark", "cell", "site", "planner", "selection"
+]  # fmt: skip
 
 MARKER = ".r3jax"
 """Folder in a folder of ours."""
@@ -46,6 +48,7 @@ _MARKS: dict[Kind, tuple[tuple[str, tuple[bytes, ...]], ...]] = {
     ),
     "planner": (("planner.json", (b'"r3jax-planner"',)),),
     "cell": (("cell.json", (b'"exploration"', b'"test_views"')),),
+    "selection": (),
     "site": (
         ("index.html", (b'<meta name="generator" content="r3jax benchmark">',)),
         ("index.html", (b"</style></head><body>\n<h1>r3jax benchmark</h1>\n",)),
@@ -286,6 +289,24 @@ def write_atomic(path: Path, data: bytes) -> None:
             with contextlib.suppress(FileNotFoundError):
                 os.unlink(temporary, dir_fd=shop.handle)
             raise
+
+
+def place_link(path: Path, target: Path) -> bool:
+    """Makes a symbolic link under a temporary name, then renames it; False where links cannot be.
+
+    Raises:
+        NotOursError: a folder on the way is a link.
+        OSError: the folder is not writable, ...
+    """
+    with _opened(path.parent) as folder, _opened(_workshop(path)) as shop:
+        temporary = shop.at(_partial_name(path))
+        try:
+            os.symlink(target, temporary, dir_fd=shop.handle)
+        except (NotImplementedError, PermissionError):  # Windows without the privilege
+            return False
+        name = folder.at(path.name)
+        os.replace(temporary, name, src_dir_fd=shop.handle, dst_dir_fd=folder.handle)
+    return True
 
 
 def check_replaceable(path: Path, mark: bytes) -> None:

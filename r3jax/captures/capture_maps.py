@@ -20,12 +20,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.captures.source import Source
 from r3jax.captures.survey import MARGIN, RANGE, Survey
 from r3jax.errors import InputError
 from r3jax.frame import Frame
+from r3jax.kernels import calls
+from r3jax.kernels.native.platform import by_platform
 from r3jax.mapping.join import combine_moments
 from r3jax.mapping.occupancy import (
     LOG_ODDS_LIMIT,
@@ -34,9 +36,9 @@ from r3jax.mapping.occupancy import (
     integrate_depth,
     mark_free_ball,
 )
-from r3jax.mapping.seen import mark_seen
+from r3jax.mapping.seen import hidden_by_none, mark_seen
 from r3jax.mapping.state import MapState, empty_map
-from r3jax.mapping.update import integrate_pixels, update_growing
+from r3jax.mapping.update import for_kernels, integrate_pixels, update_growing
 
 _CAPACITY = 1 << 15
 _MOST_ROWS = 1 << 22
@@ -83,42 +85,52 @@ def see(source: Source, survey: Survey, folds: int, on_frame: OnFrame = lambda: 
         FormatError, RunError: a file is missing or broken.
         ValueError: more voxels than any sensible voxel size would give.
     """
-    whole, grid = map_surfaces(source, survey, on_frame)
+    whole, grid = _surfaces(source, survey, on_frame)
     count = min(folds, len(survey.chosen))
-    parts = [_blank(whole)] * count
+    parts = [blank(whole)] * count
     fold_of = np.arange(len(survey.chosen)) % count
-    is_dense = jnp.asarray(source.is_dense)
     for fold, index in zip(fold_of.tolist(), survey.chosen.tolist(), strict=True):
         frame = source.frame(index, survey.alignment)
-        if source.kind == "tracks":  # a point was seen by the images of its track, and no other
-            parts[fold] = _integrate_pixels(parts[fold], frame, jnp.float32(RANGE), is_dense)
-        else:
-            parts[fold] = _join_fold(parts[fold], whole, frame, _reach(source, frame), is_dense)
+        parts[fold] = join_frame(parts[fold], whole, source, frame)
         on_frame()
     return Seen(united(parts), grid, tuple(parts), fold_of)
 
 
-def map_surfaces(
-    source: Source, survey: Survey, on_frame: OnFrame = lambda: None
-) -> tuple[MapState, OccupancyGrid]:
-    """Reads every image once: the map of the surfaces, and the grid of what is free.
-
-    Raises:
-        FormatError, RunError, ValueError: as `see`.
-    """
+def _surfaces(source: Source, survey: Survey, on_frame: OnFrame) -> tuple[MapState, OccupancyGrid]:
     state = empty_map(_CAPACITY, survey.voxel_size)
     grid = empty_grid(survey.bounds, survey.cell_size)
-    update_grid = jax.jit(integrate_depth)
     for index in survey.chosen.tolist():
         frame = source.frame(index, survey.alignment)
-        state = _grown(state, frame, source.is_dense)
-        if source.is_dense:
-            grid = update_grid(grid, frame, jnp.float32(RANGE))
-        else:
-            grid = integrate_rays(grid, np.asarray(frame.position), _measured_points(frame))
+        state = grown(state, frame, source.is_dense)
+        grid = _update_grid(grid, source, frame)
         on_frame()
-    # The camera itself was there, whatever the sensor says of places so near.
-    return state, free_round(grid, survey.alignment.points(source.poses[survey.chosen, :3, 3]))
+    return state, _with_cameras(grid, source, survey)
+
+
+def map_grid(source: Source, survey: Survey, numbers: np.ndarray) -> OccupancyGrid:
+    """Returns free and occupied space by some images, as `see` has it.
+
+    Raises:
+        FormatError, RunError: a file is missing or broken.
+    """
+    grid = empty_grid(survey.bounds, survey.cell_size)
+    for index in numbers.tolist():
+        grid = _update_grid(grid, source, source.frame(index, survey.alignment))
+    return _with_cameras(grid, source, survey)
+
+
+def _update_grid(grid: OccupancyGrid, source: Source, frame: Frame) -> OccupancyGrid:
+    if source.is_dense:
+        return _integrate_depth(grid, frame, jnp.float32(RANGE))
+    return integrate_rays(grid, np.asarray(frame.position), _measured_points(frame))
+
+
+_integrate_depth = jax.jit(integrate_depth)
+
+
+def _with_cameras(grid: OccupancyGrid, source: Source, survey: Survey) -> OccupancyGrid:
+    """Frees the places of the cameras, whatever the sensor says of places so near."""
+    return free_round(grid, survey.alignment.points(source.poses[survey.chosen, :3, 3]))
 
 
 _MOST_RAYS = 1000
@@ -196,18 +208,44 @@ def _free_ball(grid: OccupancyGrid, center: Float[Array, " 3"]) -> OccupancyGrid
     return mark_free_ball(grid, center, MARGIN)
 
 
-_integrate_pixels = jax.jit(integrate_pixels)
+def grown(state: MapState, frame: Frame, drop_edges: bool, max_range: float = RANGE) -> MapState:
+    """Returns the map with a frame's pixels, in a larger table where it needs one.
 
-
-def _grown(state: MapState, frame: Frame, drop_edges: bool) -> MapState:
-    """Adds the frame's pixels to the map, which grows as needed."""
-    arguments = frame, jnp.float32(RANGE), jnp.asarray(drop_edges)
+    Raises:
+        ValueError: so many voxels that they are surely too small.
+    """
+    arguments = frame, jnp.float32(max_range), jnp.asarray(drop_edges)
     try:
-        return update_growing(lambda now: _integrate_pixels(now, *arguments), state, _MOST_ROWS)
+        return update_growing(lambda now: _add_pixels(now, *arguments), state, _MOST_ROWS)
     except ValueError as error:
         raise InputError(
             f"the capture fills more than {_MOST_ROWS} voxels: choose a larger --voxel-size"
         ) from error
+
+
+@jax.jit
+def _add_pixels(
+    state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
+) -> MapState:
+    add = by_platform(cpu=_pixels_by_kernel, default=integrate_pixels)
+    return add(state, frame, max_range, drop_edges)
+
+
+def _pixels_by_kernel(
+    state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
+) -> MapState:
+    image = for_kernels(frame, max_range, drop_edges)
+    rows, mean, lost = calls.map_add(state.rows, state.mean, image, state.num_bins)
+    return _with_rows(state, rows, mean, state.dropped + lost)
+
+
+def _with_rows(
+    state: MapState, rows: calls.MapRows, mean: Float[Array, "3 N"], dropped: Int[Array, ""]
+) -> MapState:
+    return MapState(
+        rows.key, rows.visited, rows.counts, mean, rows.m2, rows.resolution, state.voxel_size,
+        dropped, state.num_bins,
+    )  # fmt: skip
 
 
 def _reach(source: Source, frame: Frame) -> Float[Array, ""]:
@@ -218,25 +256,79 @@ def _reach(source: Source, frame: Frame) -> Float[Array, ""]:
     return jnp.float32(min(RANGE, _SPARSE_REACH * farthest))
 
 
-def _blank(state: MapState) -> MapState:
-    """Returns a map with the same rows, without observations."""
+def blank(state: MapState) -> MapState:
+    """Returns the same rows, of which nothing has been seen."""
     empty = jax.tree.map(jnp.zeros_like, state)
     kept = lambda m: (m.key, m.voxel_size)
     return eqx.tree_at(kept, empty, kept(state))
 
 
+def join_frame(part: MapState, whole: MapState, source: Source, frame: Frame) -> MapState:
+    """Joins a frame of a capture to a map with the rows of all frames.
+
+    Args:
+        part: the map that it joins.
+        whole: the map of all frames, with the same rows.
+        source: the capture.
+        frame: the frame; its pixels have rows.
+    """
+    drop_edges = jnp.asarray(source.is_dense)
+    if source.kind == "tracks":  # a point was seen by the images of its track, and no other
+        return _add_pixels(part, frame, jnp.float32(RANGE), drop_edges)
+    reach = _reach(source, frame)
+    return join_on_rows(part, whole, frame, reach, drop_edges, jnp.float32(RANGE))
+
+
 @jax.jit
-def _join_fold(
+def join_on_rows(
     part: MapState,
     whole: MapState,
     frame: Frame,
-    max_range: Float[Array, ""],
+    reach: Float[Array, ""],
     drop_edges: Bool[Array, ""],
+    max_range: Float[Array, ""],
 ) -> MapState:
-    part = integrate_pixels(part, frame, jnp.float32(RANGE), drop_edges)
+    """Joins a frame to a map with the rows of all frames, whose surfaces say what is in view.
+
+    Args:
+        part: the map that it joins.
+        whole: the map of all frames, with the same rows.
+        frame: the frame; its pixels have rows.
+        reach: how far it looks [audit units].
+        drop_edges: False lets pixels on depth edges in.
+        max_range: pixels farther away do not count [audit units].
+    """
+    add = by_platform(cpu=_join_by_kernels, default=_join_by_formulas)
+    return add(part, whole, frame, reach, drop_edges, max_range)
+
+
+def _join_by_formulas(
+    part: MapState,
+    whole: MapState,
+    frame: Frame,
+    reach: Float[Array, ""],
+    drop_edges: Bool[Array, ""],
+    max_range: Float[Array, ""],
+) -> MapState:
+    part = integrate_pixels(part, frame, max_range, drop_edges)
     marks = lambda m: (m.visited, m.resolution)
-    marked = mark_seen(eqx.tree_at(marks, whole, marks(part)), frame, max_range)
+    marked = mark_seen(eqx.tree_at(marks, whole, marks(part)), frame, reach)
     return eqx.tree_at(marks, part, marks(marked))
+
+
+def _join_by_kernels(
+    part: MapState,
+    whole: MapState,
+    frame: Frame,
+    reach: Float[Array, ""],
+    drop_edges: Bool[Array, ""],
+    max_range: Float[Array, ""],
+) -> MapState:
+    part = _pixels_by_kernel(part, frame, max_range, drop_edges)
+    is_visible = hidden_by_none(whole, frame, reach).astype(jnp.uint8)
+    image = for_kernels(frame, reach, drop_edges)
+    rows = calls.map_mark(part.rows, image, is_visible, part.num_bins)
+    return _with_rows(part, rows, part.mean, part.dropped)
 
 
 def united(parts: Sequence[MapState]) -> MapState:

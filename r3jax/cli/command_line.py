@@ -21,6 +21,7 @@ from r3jax.cli.options.runs import (
     ReplayOptions,
     ViewOptions,
 )
+from r3jax.cli.options.select import SelectOptions
 from r3jax.cli.parsing import parse
 from r3jax.errors import InputError
 from r3jax.kernels.native.ahead import cache_folder, compile_ahead
@@ -38,6 +39,7 @@ COMMANDS = {
     "export": ExportOptions,
     "forecast": ForecastOptions,
     "audit": AuditOptions,
+    "select": SelectOptions,
     "view": ViewOptions,
     "policies": PoliciesOptions,
     "info": InfoOptions,

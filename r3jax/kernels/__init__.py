@@ -12,6 +12,7 @@ compiled. Each is held to its formula by a test.
 | `changes` | `scoring.formulas.change_of_sums` | `scoring/test_backends.py` |
 | `pixels` | `scoring.formulas.rows_in_pixels` | `scoring/test_backends.py` |
 | `terms` | `scoring.terms.score_voxels` | `scoring/test_backends.py` |
+| `gains`, `add` | `apps.select.objective.Objective` | `apps/select/test_objective.py` |
 | `composite` | `splatting.backends.reference.rasterize` | `splatting/backends/test_numba.py` |
 | `composite_gradient` | the same, by `jax.grad` | `splatting/backends/test_numba.py` |
 | `image_loss` | `splatting.training.loss.photometric_loss` | `splatting/training/test_kernels.py` |

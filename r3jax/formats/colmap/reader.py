@@ -73,12 +73,7 @@ def read_colmap(path: Path | str, images: Path | str | None = None) -> PosedImag
             noticed when they are read.
     """
     path = Path(path)
-    folder = find_model(path)
-    if folder is None:
-        what = "the folder holds no COLMAP model (no cameras.bin or cameras.txt)"
-        raise FormatError(path, what if path.is_dir() else "there is no such folder")
-    models = {part: read_model(part) for part in _parts(path, folder)}
-    folder = max(models, key=lambda part: len(models[part].images))
+    folder, models = _models(path)
     model = models[folder]
     ordered = sorted(model.images, key=lambda image: image.name)
     lenses = tuple(model.cameras[image.camera_id] for image in ordered)
@@ -95,6 +90,28 @@ def read_colmap(path: Path | str, images: Path | str | None = None) -> PosedImag
         points=_sparse_points(model.points, {image.id: i for i, image in enumerate(ordered)}),
         remark=_left_out(folder, models, image_paths),
     )
+
+
+def main_model(path: Path) -> tuple[Path, ColmapModel] | None:
+    """Returns the model of a capture that `read_colmap` takes, and its folder; None without one.
+
+    Raises:
+        FormatError: as `read_model`.
+    """
+    if find_model(path) is None:
+        return None
+    folder, models = _models(path)
+    return folder, models[folder]
+
+
+def _models(path: Path) -> tuple[Path, dict[Path, ColmapModel]]:
+    """Returns all models of a capture, and the folder of the one with most images."""
+    folder = find_model(path)
+    if folder is None:
+        what = "the folder holds no COLMAP model (no cameras.bin or cameras.txt)"
+        raise FormatError(path, what if path.is_dir() else "there is no such folder")
+    models = {part: read_model(part) for part in _parts(path, folder)}
+    return max(models, key=lambda part: len(models[part].images)), models
 
 
 def _parts(path: Path, folder: Path) -> list[Path]:

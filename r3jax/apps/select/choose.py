@@ -1,0 +1,201 @@
+"""Chooses frames one after the other, each for what it adds to the targets' renderability.
+
+Lazy greedy: R is not submodular (a direction that closes kappa's box is worth more after its
+counterpart), so that an old gain is no exact bound. `is_exact` evaluates every candidate before
+each choice; docs/howto/select.md says how often the two differ.
+
+The first frame and ties follow a rule and not the order of the frames: the largest gain; among
+equals the sharper frame, then the one nearer to the middle of the cameras, then the name.
+
+Shape symbols: n frames; k chosen; T targets.
+"""
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+
+from r3jax.apps.select.objective import Objective
+from r3jax.apps.select.observations import Observed
+from r3jax.apps.select.targets import Targets
+from r3jax.planning.lazy_greedy import renew_best
+
+_AT_ONCE = 8
+"""Candidates that are evaluated together."""
+
+_EQUAL = 1e-7
+"""Gains that differ by less of the larger one are equal: rounding depends on the order."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Frames in the order in which they were chosen."""
+
+    order: np.ndarray
+    """Numbers of the frames, [k] int64."""
+
+    gain: np.ndarray
+    """What each added to the objective, [k]."""
+
+    per_target: np.ndarray
+    """Renderability of each target after each frame, [k, T] float32."""
+
+    of_all: np.ndarray
+    """Renderability of each target after all frames, [T]."""
+
+    left: np.ndarray
+    """What each frame would add at the end, [n]; 0 for those chosen."""
+
+    is_complete: bool = True
+    """False where the choice was interrupted."""
+
+    @property
+    def objective(self) -> np.ndarray:
+        """Mean renderability of the targets after each frame, [k]."""
+        return self.per_target.mean(axis=1, dtype=np.float64)
+
+    @property
+    def share(self) -> np.ndarray:
+        """The objective as a share of what all frames give, [k]."""
+        return self.objective / max(float(self.of_all.mean()), 1e-9)
+
+
+def tie_ranks(sharpness: np.ndarray, positions: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """Ranks frames for ties, [n]: the lowest goes first.
+
+    Args:
+        sharpness: the more the sharper, [n].
+        positions: of the cameras, [n, 3].
+        names: of the frames.
+    """
+    from_middle = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
+    order = np.lexsort((np.argsort(np.argsort(names)), np.round(from_middle, 6), -sharpness))
+    ranks = np.empty(len(order), np.int64)
+    ranks[order] = np.arange(len(order))
+    return ranks
+
+
+def choose(
+    observed: Observed,
+    targets: Targets,
+    num: int,
+    *,
+    gain: float | None = None,
+    keep: Sequence[int] = (),
+    allowed: np.ndarray | None = None,
+    ranks: np.ndarray | None = None,
+    is_exact: bool = False,
+    on_choice: Callable[[], bool] = lambda: False,
+) -> Choice:
+    """Chooses frames.
+
+    Args:
+        observed: what every frame shows.
+        targets: whose renderability counts.
+        num: frames to choose at most, those to keep among them.
+        gain: share of what all allowed frames give, at which to stop; None: at `num`.
+        keep: frames that are chosen first, whatever they add.
+        allowed: False for frames that may not be chosen, [n].
+        ranks: for ties, [n], see `tie_ranks`; None: the order of the frames.
+        is_exact: evaluate every candidate before each choice.
+        on_choice: called after each frame; True ends the choice.
+    """
+    count = len(observed)
+    allowed = np.ones(count, dtype=bool) if allowed is None else allowed.copy()
+    allowed[list(keep)] = True
+    ranks = np.arange(count) if ranks is None else ranks
+    of_all = _after(observed, targets, np.flatnonzero(allowed))
+    stop = np.inf if gain is None else gain * float(of_all.mean())
+    quotas = _Quotas(component_of(observed), allowed, num)
+    objective = Objective(observed, targets)
+    bound, is_new = np.where(allowed, np.inf, -np.inf), np.zeros(count, dtype=bool)
+    bound[quotas.full()] = -np.inf
+    order, gains, values = list[int](), list[float](), list[np.ndarray]()
+    firsts = [*keep, *itertools.repeat(None, max(0, min(num, allowed.sum()) - len(keep)))]
+    is_complete = True
+    for first in firsts:
+        if first is None and objective.value >= stop:
+            break
+        if is_exact:
+            bound[np.isfinite(bound)] = np.inf
+        best = _best(bound, is_new, objective, ranks) if first is None else first
+        before = objective.value
+        objective.add(best)
+        order.append(best)
+        gains.append(objective.value - before)
+        values.append(objective.per_target.astype(np.float32))
+        bound[best], is_new[:] = -np.inf, False
+        quotas.take(best)
+        bound[quotas.full()] = -np.inf
+        if on_choice():
+            is_complete = len(order) == len(firsts)
+            break
+    rest = np.setdiff1d(np.arange(count), order)
+    left = np.zeros(count)
+    left[rest] = objective.gains(rest)
+    per_target = np.array(values, np.float32).reshape(len(order), len(targets))
+    return Choice(np.array(order, np.int64), np.array(gains), per_target, of_all, left, is_complete)
+
+
+def _best(bound: np.ndarray, is_new: np.ndarray, objective: Objective, ranks: np.ndarray) -> int:
+    """Returns the frame with the largest gain; among equals the one of the lowest rank."""
+    while True:
+        best = renew_best(bound, is_new, objective.gains, _AT_ONCE)
+        assert best is not None  # no more are chosen than may be
+        equal = np.flatnonzero(bound >= bound[best] - _EQUAL * abs(bound[best]))
+        stale = equal[~is_new[equal]]
+        if not len(stale):
+            return int(equal[np.argmin(ranks[equal])])
+        bound[stale], is_new[stale] = objective.gains(stale), True
+
+
+def _after(observed: Observed, targets: Targets, frames: np.ndarray) -> np.ndarray:
+    """Returns renderability of each target on the map of some frames, [T]."""
+    objective = Objective(observed, targets)
+    for frame in frames.tolist():
+        objective.add(frame)
+    return objective.per_target
+
+
+def component_of(observed: Observed) -> np.ndarray:
+    """Returns the scene of each frame, [n]: frames that a chain of common surfaces connects."""
+    frame, row = observed.frame[observed.is_colored], observed.row[observed.is_colored]
+    size = len(observed) + observed.num_rows
+    links = (np.ones(len(frame), dtype=bool), (frame, len(observed) + row))
+    graph = sparse.coo_matrix(links, (size, size))
+    labels = connected_components(graph, directed=False)[1][: len(observed)]
+    return np.unique(labels, return_inverse=True)[1]
+
+
+def in_proportion(sizes: np.ndarray, num: int) -> np.ndarray:
+    """Splits a number into parts in proportion to sizes (largest remainders), none above its size.
+
+    Args:
+        sizes: [g].
+        num: at most their sum.
+    """
+    exact = num * sizes / max(int(sizes.sum()), 1)
+    parts = np.floor(exact).astype(np.int64)
+    for group in np.argsort(parts - exact, kind="stable")[: num - int(parts.sum())]:
+        parts[group] += 1
+    return parts
+
+
+class _Quotas:
+    """How many frames of each scene may still be chosen."""
+
+    def __init__(self, component: np.ndarray, allowed: np.ndarray, num: int):
+        self._component = component
+        sizes = np.bincount(component[allowed], minlength=component.max(initial=0) + 1)
+        self._left = in_proportion(sizes, min(num, int(sizes.sum())))
+
+    def take(self, frame: int) -> None:
+        """Counts a frame that was chosen."""
+        self._left[self._component[frame]] -= 1
+
+    def full(self) -> np.ndarray:
+        """Returns frames that may not be chosen, since their scene has its share."""
+        return np.flatnonzero(self._left[self._component] <= 0)

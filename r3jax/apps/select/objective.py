@@ -1,0 +1,193 @@
+"""The objective: the mean renderability of targets, and what one more frame adds to it.
+
+A frame observes rows of the map of all frames: a direction bin, a resolution, a color. With the
+frames chosen so far a row has a count, a mean color, a spread and a best resolution; a pair of a
+row and a target that shows it has the nearest seen direction and the sides of kappa's box. All of
+them take another observation in constant time, so that a gain costs what the frame shows.
+
+The value is that of `scoring.terms.score_voxels` on the map of just the frames chosen
+(`renderability_of` computes it that way). `kernels.scoring.frame_gains` has the same in machine
+code, which is held to this.
+
+Shape symbols: N rows; P pairs; T targets; n frames; m observations.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from r3jax.apps.select.observations import Observed
+from r3jax.apps.select.targets import Targets
+from r3jax.geometry.sphere import fibonacci_lattice
+from r3jax.kernels.constants import ON_EDGE
+from r3jax.kernels.native.platform import missing_for_machine_code
+from r3jax.mapping.state import MapState
+from r3jax.scoring.terms import score_voxels
+
+_ALL_SIDES = 15
+
+
+class Objective:
+    """Mean renderability of targets while frames are added; the arrays change in place."""
+
+    def __init__(self, observed: Observed, targets: Targets, *, uses_kernel: bool | None = None):
+        """Nothing is chosen yet.
+
+        Args:
+            observed: what every frame shows.
+            targets: whose renderability counts.
+            uses_kernel: machine code, or the formula; None: machine code where there is any.
+        """
+        num, pairs = observed.num_rows, len(targets.target)
+        self._observed, self._targets = observed, targets
+        self._lattice = fibonacci_lattice(observed.num_bins).astype(np.float32)
+        self._count, self._m2 = np.zeros(num, np.float32), np.zeros(num, np.float32)
+        self._mean, self._resolution = np.zeros((num, 3), np.float32), np.zeros(num, np.float32)
+        self._cosine, self._value = np.zeros(pairs, np.float32), np.zeros(pairs, np.float32)
+        self._sides = np.zeros(pairs, np.uint8)
+        self._totals = np.zeros(len(targets))
+        self._uses_kernel = not missing_for_machine_code() if uses_kernel is None else uses_kernel
+
+    @property
+    def per_target(self) -> np.ndarray:
+        """Renderability of each target, [T]."""
+        return self._totals.copy()
+
+    @property
+    def value(self) -> float:
+        """Mean over the targets."""
+        return float(self._totals.mean())
+
+    def gains(self, frames: np.ndarray) -> np.ndarray:
+        """Computes what each of some frames [c] would add to the value, [c]."""
+        if self._uses_kernel:
+            from r3jax.kernels.scoring import frame_gains
+
+            found = frame_gains.gains(*self._structs(), np.asarray(frames, np.int64), self._lattice)
+        else:
+            found = np.array([self._changed(int(frame)).gain.sum() for frame in frames])
+        return found / len(self._targets)
+
+    def add(self, frame: int) -> None:
+        """Adds a frame to those chosen."""
+        if self._uses_kernel:
+            from r3jax.kernels.scoring import frame_gains
+
+            frame_gains.add(*self._structs(), frame, self._lattice, self._totals)
+            return
+        after = self._changed(frame)
+        self._count[after.row], self._mean[after.row] = after.counts, after.mean
+        self._m2[after.row], self._resolution[after.row] = after.m2, after.resolution
+        self._cosine[after.pair], self._sides[after.pair] = after.cosine, after.sides
+        self._value[after.pair] = after.value
+        target = self._targets.target[after.pair]
+        self._totals += np.bincount(target, after.gain, len(self._targets))
+
+    def _structs(self) -> tuple[Any, Any, Any, Any]:
+        """Returns the arrays as the kernel takes them."""
+        from r3jax.kernels.scoring import frame_gains as kernel
+
+        seen, to = self._observed, self._targets
+        return (
+            kernel.Rows(seen.center, self._count, self._mean, self._m2, self._resolution),
+            kernel.Pairs(to.first, to.target, to.weight, self._cosine, self._sides, self._value),
+            kernel.Observations(
+                seen.first, seen.row, seen.direction, seen.resolution, seen.color, seen.is_colored
+            ),
+            kernel.Targets(to.position, to.focal),
+        )
+
+    def _changed(self, frame: int) -> "_Changed":
+        """Returns rows and pairs that a frame changes, with their values and gains."""
+        seen, to = self._observed, self._targets
+        part = slice(int(seen.first[frame]), int(seen.first[frame + 1]))
+        rows, colored = seen.row[part], seen.is_colored[part]
+        before = self._count[rows]
+        count = before + colored
+        gap = np.where(colored[:, None], seen.color[part] - self._mean[rows], 0.0)
+        safe = np.maximum(count, 1.0)
+        mean = self._mean[rows] + gap / safe[:, None]
+        m2 = self._m2[rows] + (gap**2).sum(axis=1) * before / safe
+        best = np.maximum(self._resolution[rows], seen.resolution[part])
+        length = to.first[rows + 1] - to.first[rows]
+        at = np.repeat(np.arange(len(rows)), length)
+        pair = np.arange(length.sum()) + np.repeat(
+            to.first[rows] - np.cumsum(length) + length, length
+        )
+        offset = to.position[to.target[pair]] - seen.center[rows][at]
+        distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-6)
+        r, q = offset / distance[:, None], self._lattice[seen.direction[part]][at]
+        cosine = (q * r).sum(axis=1)
+        sides = self._sides[pair] | np.where(cosine > 0.0, _sides(q, r), 0).astype(np.uint8)
+        cosine = np.clip(np.maximum(cosine, self._cosine[pair]), 0.0, 1.0)
+        value = _value(
+            cosine, sides == _ALL_SIDES, _consistency(count, m2)[at],
+            np.minimum(best[at] * distance / to.focal[to.target[pair]], 1.0),
+        )  # fmt: skip
+        value = np.where(count[at] > 0.0, value, self._value[pair])
+        gain = to.weight[pair] * (value - self._value[pair]).astype(np.float64)
+        return _Changed(rows, count, mean, m2, best, pair, cosine, sides, value, gain)
+
+
+class _Changed(NamedTuple):
+    """Rows and pairs that a frame changes, with their new values."""
+
+    row: np.ndarray
+    counts: np.ndarray
+    mean: np.ndarray
+    m2: np.ndarray
+    resolution: np.ndarray
+    pair: np.ndarray
+    cosine: np.ndarray
+    sides: np.ndarray
+    value: np.ndarray
+    gain: np.ndarray
+
+
+def _sides(q: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """Returns a bit for each side of the tangent axes at r on which q lies, [P]."""
+    x, y, z = r.T
+    is_pole = x * x + y * y < 1e-12
+    a_x, a_y = np.where(is_pole, 1.0, -y), np.where(is_pole, 0.0, x)
+    a = q[:, 0] * a_x + q[:, 1] * a_y
+    b = q[:, 0] * -z * a_y + q[:, 1] * z * a_x + q[:, 2] * (x * a_y - y * a_x)
+    return (a <= ON_EDGE) + 2 * (a >= -ON_EDGE) + 4 * (b <= ON_EDGE) + 8 * (b >= -ON_EDGE)
+
+
+def _consistency(count: np.ndarray, m2: np.ndarray) -> np.ndarray:
+    spread = np.sqrt(2.0 / 1.5 * m2 / np.maximum(count - 1.0, 1.0))
+    return np.where(count > 1.0, np.clip(1.0 - spread, 0.0, 1.0), 1.0)
+
+
+def _value(
+    cosine: np.ndarray, is_inside: np.ndarray, delta: np.ndarray, ratio: np.ndarray
+) -> np.ndarray:
+    """Returns R of pairs (`scoring.terms`)."""
+    kappa = np.where(is_inside, 1.0, 2.0)
+    bias = cosine**kappa
+    return bias * delta ** (kappa * (1.0 - bias)) * ratio ** (1.0 - delta * bias)
+
+
+def renderability_of(observed: Observed, targets: Targets, frames: Sequence[int]) -> np.ndarray:
+    """Computes the renderability of every target on the map of just some frames, [T].
+
+    By the formulas of the package, from nothing: what `Objective` brings up to date.
+    """
+    state = observed.map_of(frames)
+    row = np.repeat(np.arange(observed.num_rows), np.diff(targets.first))
+    value = np.asarray(_values(state, jnp.asarray(targets.position), jnp.asarray(targets.focal)))
+    shares = targets.weight.astype(np.float64) * value[targets.target, row]
+    return np.bincount(targets.target, shares, len(targets))
+
+
+@jax.jit
+def _values(
+    state: MapState, position: Float[Array, "T 3"], focal: Float[Array, " T"]
+) -> Float[Array, "T N"]:
+    """Returns R of every row from every target."""
+    score = lambda position, focal: score_voxels(state, position, focal).value
+    return jax.lax.map(lambda pair: score(*pair), (position, focal))

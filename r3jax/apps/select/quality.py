@@ -1,0 +1,126 @@
+"""How good the pictures are, in the terms of the formulas.
+
+Blur. Detail that a frame shows, as a share of that of its neighbors (`captures.faults`), becomes
+the width of a blur, and the resolution of what the frame observes is divided by it. A blur of b
+pixels in all directions leaves about 1 / b^2 of the squared second differences: of pictures of two
+recordings that were blurred on purpose 0.27 and 0.48 (b = 2), 0.10 and 0.21 (3), 0.04 and 0.10 (4).
+Where all frames are blurred alike, nothing tells.
+
+Exposure. The colors of a frame are divided by a gain for each channel, fitted to the mean colors of
+the surfaces; what contradicts the others after that lowers their consistency.
+
+Shape symbols: n frames; m observations; N rows.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from r3jax.apps.select.observations import Observed
+from r3jax.captures.faults.appearance import repeats, sharpness
+from r3jax.captures.faults.blocks import BlockImage, overlaps
+from r3jax.captures.faults.faults import BLURRED
+
+_FEWEST = 40
+"""Surfaces shared with other frames below which no exposure is fitted."""
+
+_DARK, _BRIGHT = 0.05, 0.95
+"""Colors beyond these are clipped, or nearly, and say little of a gain."""
+
+_ROUNDS = 8
+"""Rounds in which means of surfaces and gains of frames are brought up to date."""
+
+_MOST_GAIN = 4.0
+"""Larger ones are a frame of something else."""
+
+
+@dataclass(frozen=True)
+class Quality:
+    """What is known of the pictures of frames."""
+
+    blur: np.ndarray
+    """Width of the blur beside that of the neighbors, at least 1, [n] [px]."""
+
+    is_compared: np.ndarray
+    """False where no neighbors show the same surface, and blur is not known, [n]."""
+
+    exposure: np.ndarray
+    """Gain of each channel over the others' frames, [n, 3]."""
+
+    twin_of: np.ndarray
+    """The sharper frame that each one repeats, [n] int64; -1: none."""
+
+    @property
+    def is_blurred(self) -> np.ndarray:
+        """True for frames that are clearly blurred, [n]."""
+        return self.blur > 1.0 / np.sqrt(BLURRED)
+
+
+def quality_of(images: Sequence[BlockImage], observed: Observed) -> Quality:
+    """Compares the frames of a capture.
+
+    Args:
+        images: of the frames, [n].
+        observed: what they show.
+    """
+    share = sharpness(images, overlaps(images)).share
+    is_compared = np.isfinite(share)
+    blur = 1.0 / np.sqrt(np.clip(np.where(is_compared, share, 1.0), 1e-2, 1.0))
+    twin_of = np.full(len(images), -1)
+    for group in repeats(images):
+        best = min(group, key=lambda i: (blur[i], i))
+        twin_of[[i for i in group if i != best]] = best
+    return Quality(blur, is_compared, exposures(observed), twin_of)
+
+
+def unknown_quality(observed: Observed) -> Quality:
+    """Returns the quality of frames without pictures."""
+    count = len(observed)
+    none = np.zeros(count, dtype=bool)
+    return Quality(np.ones(count), none, np.ones((count, 3)), np.full(count, -1))
+
+
+def with_quality(observed: Observed, blur: np.ndarray, exposure: np.ndarray) -> Observed:
+    """Returns the same observations as blurred frames give them, and without their exposure.
+
+    Args:
+        observed: what the frames show.
+        blur: [n] [px].
+        exposure: [n, 3].
+    """
+    frame = observed.frame
+    return dataclasses.replace(
+        observed,
+        resolution=(observed.resolution / blur[frame]).astype(np.float32),
+        color=(observed.color / exposure[frame]).astype(np.float32),
+    )
+
+
+def exposures(observed: Observed) -> np.ndarray:
+    """Fits a gain of each frame and channel to the mean colors of the surfaces, [n, 3].
+
+    The median over the surfaces, in turn with the means; gains of the median frame are 1. A frame
+    that shares few surfaces with others has 1.
+    """
+    used = observed.is_colored & (observed.color > _DARK).all(axis=1)
+    used &= (observed.color < _BRIGHT).all(axis=1)
+    used &= np.bincount(observed.row[used], minlength=observed.num_rows)[observed.row] > 1
+    row, frame = observed.row[used], observed.frame[used]
+    log = np.log(np.maximum(observed.color[used], np.float32(1e-6)))
+    gain, num = np.zeros((len(observed), 3), np.float32), observed.num_rows
+    ends = np.searchsorted(frame, np.arange(len(observed) + 1))
+    count = np.maximum(np.bincount(row, minlength=num), 1)
+    for _ in range(_ROUNDS):
+        own = log - gain[frame]
+        mean = np.stack([np.bincount(row, column, num) / count for column in own.T], axis=1)
+        apart = log - mean[row]
+        for i, (begin, end) in enumerate(itertools.pairwise(ends)):
+            if end - begin >= _FEWEST:
+                gain[i] = np.median(apart[begin:end], axis=0)
+        fitted = np.diff(ends) >= _FEWEST
+        if fitted.any():
+            gain[fitted] -= np.median(gain[fitted], axis=0)
+    return np.exp(np.clip(gain, -np.log(_MOST_GAIN), np.log(_MOST_GAIN)))

@@ -1,0 +1,422 @@
+"""One capture, of which some frames are kept: reading, comparing, choosing, and why not the others.
+
+Shape symbols: n frames that can be read; T targets; k chosen.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from r3jax.apps.select.choose import Choice, choose, component_of, tie_ranks
+from r3jax.apps.select.observations import Observed, map_frames, observe
+from r3jax.apps.select.quality import (
+    Quality,
+    exposures,
+    quality_of,
+    unknown_quality,
+    with_quality,
+)
+from r3jax.apps.select.settings import FRAMES, STAND, SelectSettings
+from r3jax.apps.select.targets import Targets, see_targets
+from r3jax.captures.camera_paths import path_of
+from r3jax.captures.capture_maps import join_frame, join_on_rows, map_grid
+from r3jax.captures.faults.blocks import BlockImage, block_image
+from r3jax.captures.source import Picture, Source, thinned
+from r3jax.captures.standpoints import standpoints_of
+from r3jax.captures.survey import RANGE, Survey, survey_of
+from r3jax.errors import InputError
+from r3jax.formats.errors import FormatError
+from r3jax.frame import Frame
+from r3jax.geometry.cameras import Camera, angle_between
+from r3jax.mapping.state import MapState
+from r3jax.planning.candidates import poses_along
+
+STANDPOINTS, _DIRECTIONS = 24, 8
+"""Places from which views are targets, and level directions from each."""
+
+_OUTSIDE = 0.05
+"""A target of which fewer pixels show anything lies outside of the capture."""
+
+_TWIN = (0.1, 8.0)
+"""A frame this near to a chosen one, in median depths, and turned by at most so much [deg], is its
+twin."""
+
+_SEVERAL = 0.02
+"""Scenes with a smaller share of the frames are frames beside the others, and not mentioned."""
+
+Progress = Callable[[str, int], None]
+"""Called with the name of a stage and the number of its steps when it begins; and with an empty
+name after each step."""
+
+
+@dataclass(frozen=True)
+class Selected:
+    """Everything that a selection found. Poses are in the capture's coordinates."""
+
+    source: Source
+    survey: Survey
+    settings: SelectSettings
+    used: np.ndarray
+    """Numbers in the capture of the frames that were looked at, [n]."""
+
+    whole: MapState
+    """Map of all of them [audit units]."""
+
+    quality: Quality
+    choice: Choice
+    """Numbers in it count along `used`."""
+
+    targets: int
+    """Number of targets T."""
+
+    scenes: np.ndarray
+    """Scene of each frame, [n]."""
+
+    reasons: dict[int, str]
+    """Why frames were dropped, a few words, by their numbers in the capture."""
+
+    notes: tuple[str, ...] = field(default=())
+    """Returns what the user should know, sentences."""
+
+    @property
+    def kept(self) -> np.ndarray:
+        """Numbers in the capture of the frames kept, ascending."""
+        return np.sort(self.used[self.choice.order])
+
+
+def select(
+    source: Source,
+    settings: SelectSettings | None = None,
+    *,
+    capture: object = None,
+    on_progress: Progress = lambda stage, steps: None,
+    is_interrupted: Callable[[], bool] = lambda: False,
+) -> Selected:
+    """Chooses the frames of a capture that are kept.
+
+    Args:
+        source: the capture.
+        settings: how many, and for which targets.
+        capture: what was opened, in whose coordinates a camera path is.
+        on_progress: for a progress bar.
+        is_interrupted: asked after each choice; what was chosen so far is the result then.
+
+    Raises:
+        ValueError: no two frames show the same surface; a name of a frame that does not exist; a
+            camera path outside of the capture; nothing would be kept.
+        FormatError: fewer than two frames can be read, or nothing is said of depth.
+        RunError: a file of a run is missing or broken.
+    """
+    settings = SelectSettings() if settings is None else settings
+    if settings.depth_scale != 1.0 or settings.depth_along_ray:
+        source = source.with_depth(settings.depth_scale, is_along_ray=settings.depth_along_ray)
+    step = lambda: on_progress("", 1)
+    on_progress("looking at the capture", 0)
+    survey = survey_of(source, settings)
+    on_progress("reading frames", len(survey.chosen))
+    whole, images, unread = _surfaces(source, survey, step)
+    used = np.setdiff1d(survey.chosen, list(unread))
+    if len(used) < 2:
+        raise next(iter(unread.values()), FormatError(Path(source.name), "fewer than two frames"))
+    on_progress("finding what each frame shows", len(used))
+    read = lambda number: source.frame(int(used[number]), survey.alignment)
+    join = lambda part, whole, frame: join_frame(part, whole, source, frame)
+    observed = observe(whole, read, len(used), join, step)
+    scenes = component_of(observed)
+    if scenes.max() + 1 == len(used):
+        raise InputError(
+            f"{source.name}: no two of its {len(used)} frames show the same surface, so there is "
+            "nothing to choose between: are the poses right?"
+        )
+    on_progress("comparing frames", 0)
+    quality = quality_of(images, observed) if source.has_images else unknown_quality(observed)
+    observed = with_quality(observed, quality.blur, quality.exposure)
+    keep = _named(source, used, settings.keep)
+    allowed, reasons = _allowed(settings, quality, source, used, keep)
+    on_progress("drawing targets", 0)
+    targets = _targets(source, survey, settings, whole, observed, used, capture)
+    num = settings.number(len(used)) if settings.chooses else int(allowed.sum())
+    on_progress("choosing frames", num)
+    choice = choose(
+        observed,
+        targets,
+        max(num, len(keep)),
+        gain=settings.wanted_gain if settings.chooses else None,
+        keep=keep if settings.chooses else np.flatnonzero(allowed).tolist(),
+        allowed=allowed,
+        ranks=tie_ranks(-quality.blur, source.poses[used, :3, 3], [source.labels[i] for i in used]),
+        is_exact=settings.exact,
+        on_choice=lambda: is_interrupted() or bool(step()),
+    )
+    found = Selected(
+        source, survey, settings, used, whole, quality, choice, len(targets), scenes, {}
+    )
+    reasons |= _reasons(found, reasons)
+    reasons |= {index: f"cannot be read: {error.reason}" for index, error in unread.items()}
+    reasons |= dict.fromkeys(survey.strays, "its pose has diverged")
+    notes = _notes(found, targets, len(unread))
+    return Selected(
+        source, survey, settings, used, whole, quality, choice, len(targets), scenes, reasons,
+        notes,
+    )  # fmt: skip
+
+
+def _surfaces(
+    source: Source, survey: Survey, on_frame: Callable[[], None]
+) -> tuple[MapState, list[BlockImage], dict[int, FormatError]]:
+    """Returns the map of all frames, their pictures in blocks, and unreadable frames."""
+    images: list[BlockImage] = []
+    unread: dict[int, FormatError] = {}
+
+    def frames() -> Iterator[Frame]:
+        for index in survey.chosen.tolist():
+            try:
+                picture: Picture = source.read(index)
+            except FormatError as error:
+                unread[index] = error
+            else:
+                images.append(block_image(*picture, source.camera(index), source.poses[index]))
+                yield source.framed(picture, index, survey.alignment)
+            on_frame()
+
+    whole = map_frames(frames(), survey.voxel_size, drop_edges=source.is_dense)
+    return whole, images, unread
+
+
+def _named(source: Source, used: np.ndarray, names: Sequence[str]) -> list[int]:
+    """Returns numbers among `used` of the frames with some names, with or without their suffix."""
+    found: list[int] = []
+    for name in names:
+        fits = [i for i, index in enumerate(used) if _is_named(source.labels[index], name)]
+        if len(fits) != 1:
+            how = "no frame" if not fits else f"{len(fits)} frames"
+            raise InputError(
+                f"--keep {name}: {how} of the capture {'has' if not fits else 'have'} that name, "
+                f"such as {source.labels[used[0]]}"
+            )
+        found += [i for i in fits if i not in found]
+    return found
+
+
+def _is_named(label: str, name: str) -> bool:
+    return name in (label, Path(label).name, Path(label).stem, label.rpartition(" ")[2])
+
+
+def _allowed(
+    settings: SelectSettings,
+    quality: Quality,
+    source: Source,
+    used: np.ndarray,
+    keep: Sequence[int],
+) -> tuple[np.ndarray, dict[int, str]]:
+    """Returns frames that may be chosen, [n], and why the others may not.
+
+    Raises:
+        ValueError: none may be.
+    """
+    reasons: dict[int, str] = {}
+    allowed = np.ones(len(used), dtype=bool)
+    if settings.drop_duplicates:
+        for i in np.flatnonzero(quality.twin_of >= 0).tolist():
+            allowed[i] = False
+            reasons[int(used[i])] = f"twin of {source.labels[used[quality.twin_of[i]]]}"
+    if settings.drop_blurred:
+        for i in np.flatnonzero(quality.is_blurred).tolist():
+            allowed[i] = False
+            reasons[int(used[i])] = f"blurred by {quality.blur[i]:.1f} px"
+    allowed[list(keep)] = True
+    for i in keep:
+        reasons.pop(int(used[i]), None)
+    if not allowed.any():
+        raise InputError(
+            f"{source.name}: all {len(used)} frames are blurred, and none would be kept: leave "
+            "out --drop-blurred, or take the capture again"
+        )
+    return allowed, reasons
+
+
+def _targets(
+    source: Source,
+    survey: Survey,
+    settings: SelectSettings,
+    whole: MapState,
+    observed: Observed,
+    used: np.ndarray,
+    capture: object,
+) -> Targets:
+    """Returns the views whose renderability counts.
+
+    Raises:
+        ValueError: a camera path that shows nothing of the capture.
+        FormatError, RunError: a camera path that cannot be read.
+    """
+    if settings.targets == FRAMES:
+        cameras = [source.camera(int(i)) for i in used]
+        poses = survey.alignment.poses(source.poses[used])
+    elif settings.targets == STAND:
+        grid = map_grid(source, survey, used)
+        stood = survey.alignment.points(source.poses[used, :3, 3])
+        places = standpoints_of(whole, grid, stood, STANDPOINTS, source.is_dense)
+        angles = 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+        level = np.stack([np.cos(angles), np.sin(angles), np.zeros(_DIRECTIONS)], axis=1)
+        poses = poses_along(
+            np.repeat(places, _DIRECTIONS, axis=0), np.tile(level, (len(places), 1))
+        )
+        cameras = [source.camera(int(used[0]))] * len(poses)
+    else:
+        path = path_of(Path(settings.targets), capture)
+        poses = survey.alignment.poses(path.poses)
+        cameras = [thinned(lens.camera, source.stride) for lens in path.lenses]
+    targets = see_targets(whole, observed, cameras, poses, RANGE)
+    if settings.targets != FRAMES and not (targets.coverage >= _OUTSIDE).any():
+        raise InputError(
+            f"--targets {settings.targets}: its {len(targets)} views show nothing of the capture: "
+            "is the path in the capture's coordinates?"
+        )
+    return targets
+
+
+def _reasons(found: Selected, known: dict[int, str]) -> dict[int, str]:
+    """Returns why the frames that were not chosen were not, by their numbers in the capture."""
+    source, used, quality = found.source, found.used, found.quality
+    order = found.choice.order
+    total = max(float(found.choice.of_all.mean()), 1e-9)
+    reasons: dict[int, str] = {}
+    for i in np.setdiff1d(np.arange(len(used)), order).tolist():
+        index, share = int(used[i]), float(found.choice.left[i]) / total
+        if index in known:
+            continue
+        twin = _twin(found, i)
+        if quality.is_blurred[i]:
+            reasons[index] = f"blurred by {quality.blur[i]:.1f} px"
+        elif twin is not None:
+            reasons[index] = f"twin of {source.labels[used[twin]]}"
+        elif share < 0.0005:
+            reasons[index] = "adds nothing"
+        else:
+            reasons[index] = f"adds {100 * share:.1f} %"
+    return reasons
+
+
+def _twin(found: Selected, frame: int) -> int | None:
+    """Returns the chosen frame that shows nearly the same; None: there is none."""
+    poses = found.source.poses[found.used]
+    order = found.choice.order
+    near, turned = _TWIN
+    apart = np.linalg.norm(poses[order, :3, 3] - poses[frame, :3, 3], axis=1)
+    best = int(order[np.argmin(apart)])
+    if apart.min() > near * found.survey.median_depth:
+        return None
+    is_alike = angle_between(poses[best], poses[frame]) < np.radians(turned)
+    return best if is_alike else None
+
+
+def _notes(found: Selected, targets: Targets, num_unread: int) -> tuple[str, ...]:
+    """What the user should know, sentences."""
+    settings, used, notes = found.settings, found.used, list[str]()
+    if settings.frames is not None and settings.frames > len(used):
+        notes.append(
+            f"{settings.frames} frames were asked for, and the capture has {len(used)}: all are "
+            "kept."
+        )
+    if num_unread:
+        notes.append(f"{num_unread} frames cannot be read and are left out.")
+    sizes = np.bincount(found.scenes)
+    large = np.flatnonzero(sizes >= max(2, _SEVERAL * len(used)))
+    if len(large) > 1:
+        kept = np.bincount(found.scenes[found.choice.order], minlength=len(sizes))
+        parts = ", ".join(f"{kept[i]} of {sizes[i]}" for i in large)
+        notes.append(
+            f"The capture holds {len(large)} scenes that share no surface: frames of each are kept "
+            f"in proportion ({parts})."
+        )
+    blurred = found.quality.is_blurred
+    if blurred[found.choice.order].any():
+        notes.append(
+            f"{int(blurred[found.choice.order].sum())} of the frames kept are blurred: each added "
+            "more than any sharp one when it was chosen."
+        )
+    outside = int((targets.coverage < _OUTSIDE).sum())
+    if outside and settings.targets != FRAMES:
+        notes.append(
+            f"{outside} of the {len(targets)} target views show next to nothing of the capture, "
+            "whatever is kept."
+        )
+    if not found.choice.is_complete:
+        notes.append("The choice was interrupted: the frames chosen so far are kept.")
+    if found.source.remark:
+        notes.append(found.source.remark)
+    return tuple(notes)
+
+
+def select_frames(
+    frames: Sequence[Frame],
+    num: int | None = None,
+    *,
+    share: float | None = None,
+    gain: float | None = None,
+    targets: ArrayLike | None = None,
+    camera: Camera | None = None,
+    keep: Sequence[int] = (),
+    blur: Sequence[float] | ArrayLike | None = None,
+    voxel_size: float = 0.05,
+    max_range: float = 5.0,
+    exact: bool = False,
+) -> Choice:
+    """Chooses the frames that are enough to render some views well.
+
+    Lazy greedy on the mean renderability of the targets; ties go to the sharper frame, and then to
+    the one nearer to the middle, so that the order of the frames does not matter.
+
+    Args:
+        frames: posed images with depth; read twice, one by one.
+        num: frames to choose.
+        share: the same as a share of all.
+        gain: choose as many as it takes to reach this share of what all frames give. Without any
+            of the three: 0.95.
+        targets: `T_world_camera` of the views that count, [T, 4, 4]; None: the frames' own.
+        camera: of the targets; None: that of the first frame.
+        keep: numbers of frames that are chosen first.
+        blur: width of each frame's blur, [n] [px], 1 where it is sharp; None: all are.
+        voxel_size: edge of a voxel of the map [m].
+        max_range: surfaces farther from a camera do not count [m].
+        exact: evaluate every frame before each choice.
+
+    Returns:
+        The order, what each frame adds, and the renderability of the targets after each.
+
+    Raises:
+        ValueError: no frames; settings that contradict each other; arrays that do not fit.
+    """
+    settings = SelectSettings(frames=num, share=share, gain=gain)
+    count = len(frames)
+    widths = np.ones(count) if blur is None else np.asarray(blur, np.float64)
+    if not count:
+        raise InputError("there are no frames to choose from")
+    if widths.shape != (count,) or not (widths >= 1.0).all():
+        raise InputError(f"blur must hold a width of at least 1 px for each of the {count} frames")
+    if any(not 0 <= number < count for number in keep):
+        raise InputError(f"keep must hold numbers of the {count} frames, got {list(keep)}")
+    whole = map_frames(iter(frames), voxel_size, max_range=max_range)
+    reach, edges = jnp.float32(max_range), jnp.asarray(True)
+    join = lambda part, whole, frame: join_on_rows(part, whole, frame, reach, edges, reach)
+    observed = observe(whole, lambda i: frames[i], count, join)
+    observed = with_quality(observed, widths, exposures(observed))
+    own = np.stack([np.asarray(frame.T_world_camera) for frame in frames])
+    poses = own if targets is None else np.asarray(targets, np.float64)
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not len(poses):
+        raise InputError(f"targets must have shape [T, 4, 4], got {poses.shape}")
+    if targets is None and camera is None:
+        cameras = [frame.camera for frame in frames]
+    else:
+        cameras = [frames[0].camera if camera is None else camera] * len(poses)
+    seen = see_targets(whole, observed, cameras, poses, max_range)
+    names = [f"{number:09d}" for number in range(count)]
+    return choose(
+        observed, seen, settings.number(count), gain=settings.wanted_gain, keep=list(keep),
+        ranks=tie_ranks(-widths, own[:, :3, 3], names), is_exact=exact,
+    )  # fmt: skip

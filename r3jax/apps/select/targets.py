@@ -1,0 +1,115 @@
+"""The views whose renderability counts: which voxels they show, in which share of their pixels.
+
+Shape symbols: T targets; P pairs of a row and a target that shows it; N rows; h w buffer size.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from r3jax.apps.select.observations import Observed, ordered_rows
+from r3jax.geometry.cameras import Camera
+from r3jax.mapping.state import MapState
+from r3jax.scoring.backend import rows_in_pixels
+from r3jax.scoring.config import ScoringConfig
+from r3jax.visibility.views import pinhole_view
+
+BUFFER = 96
+"""Longer side of the images of the targets [px]: a tenth of a voxel's weight is not needed."""
+
+_AT_ONCE = 32
+"""Targets that are drawn at once."""
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Views, and the pairs of a row and a view that shows it, sorted by row and then by view."""
+
+    position: np.ndarray
+    """Camera centers, [T, 3] float32."""
+
+    focal: np.ndarray
+    """Focal lengths of R, [T] float32 [px]."""
+
+    first: np.ndarray
+    """First pair of each row, and the number of pairs, [N + 1] int64."""
+
+    target: np.ndarray
+    """[P] int32."""
+
+    weight: np.ndarray
+    """Share of the target's pixels that show the row, [P] float32; what they lack is unseen."""
+
+    def __len__(self) -> int:
+        """Returns number of targets."""
+        return len(self.focal)
+
+    @property
+    def coverage(self) -> np.ndarray:
+        """Share of the pixels that show any voxel, [T]."""
+        return np.bincount(self.target, self.weight, len(self))
+
+
+def see_targets(
+    whole: MapState,
+    observed: Observed,
+    cameras: Sequence[Camera],
+    poses: np.ndarray,
+    max_range: float,
+) -> Targets:
+    """Draws every target once.
+
+    Args:
+        whole: the map of all frames.
+        observed: what they observe, whose rows are numbered otherwise.
+        cameras: of the targets, [T].
+        poses: `T_world_camera`, [T, 4, 4].
+        max_range: what is farther is not shown.
+    """
+    config = ScoringConfig(max_range=max_range, zbuffer_size=BUFFER)
+    row_of = np.full(whole.capacity, -1, np.int64)
+    row_of[ordered_rows(whole)] = np.arange(observed.num_rows)
+    pairs: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    begin = 0
+    # Cameras of one size compile to one program.
+    for _, group in groupby(cameras, key=_as_key):
+        size = len(list(group))
+        T = jnp.asarray(poses[begin : begin + size], dtype=jnp.float32)
+        for start in range(0, size, _AT_ONCE):
+            some = T[np.minimum(np.arange(start, start + _AT_ONCE), size - 1)]
+            images = np.asarray(_draw(whole, cameras[begin], some, config))
+            for number, image in enumerate(images[: size - start], start=begin + start):
+                shown, pixels = np.unique(image[image < whole.capacity], return_counts=True)
+                share = (pixels / image.size).astype(np.float32)
+                pairs.append((row_of[shown], np.full(len(shown), number, np.int32), share))
+        begin += size
+    row, target, weight = (np.concatenate(column) for column in zip(*pairs, strict=True))
+    order = np.lexsort((target, row))
+    first = np.searchsorted(row[order], np.arange(observed.num_rows + 1))
+    return Targets(
+        position=np.ascontiguousarray(poses[:, :3, 3], dtype=np.float32),
+        focal=np.array([float(camera.focal) for camera in cameras], np.float32),
+        first=first.astype(np.int64),
+        target=target[order],
+        weight=weight[order],
+    )
+
+
+def _as_key(camera: Camera) -> tuple[int | float, ...]:
+    lens = (camera.fx, camera.fy, camera.cx, camera.cy)
+    return (camera.width, camera.height, *map(float, lens))
+
+
+@jax.jit
+def _draw(
+    whole: MapState, camera: Camera, poses: Float[Array, "T 4 4"], config: ScoringConfig
+) -> Int[Array, "T h w"]:
+    def draw(pose: Float[Array, "4 4"]) -> Int[Array, "h w"]:
+        return rows_in_pixels(whole, pinhole_view(camera, pose, config), config)
+
+    return jax.vmap(draw)(poses)

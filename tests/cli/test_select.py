@@ -1,0 +1,236 @@
+"""`r3jax select`, as a user meets it: reduced captures that other programs read."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from r3jax.captures import capture_maps
+from r3jax.captures.camera_paths import write_camera_path
+from r3jax.cli.main import main
+from r3jax.formats.captures import open_capture
+from r3jax.formats.colmap.reader import find_model, read_model
+from r3jax.formats.nerfstudio import read_transforms
+from tests.apps.audit.room import (
+    LENS,
+    pose_at,
+    round_poses,
+    write_colmap,
+    write_nerfstudio,
+    write_recording,
+)
+from tests.conftest import shared_path
+from tests.formats.phones import video
+
+pytestmark = pytest.mark.full
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _small_maps():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(capture_maps, "_CAPACITY", 1 << 13)
+        yield
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory):
+    """The same room as a recording, with depth for nerfstudio, and as a COLMAP model."""
+    folder = tmp_path_factory.mktemp("captures")
+    write_recording(folder / "recording", round_poses())
+    write_nerfstudio(folder / "nerfstudio", round_poses(), depth=True)
+    write_colmap(folder / "colmap", round_poses(), scale=3.0)
+    return folder
+
+
+def select(capture, out, *words):
+    return main(["select", str(capture), "--out", str(out), "--voxel-size", "0.15", *words])
+
+
+def record_of(out):
+    return json.loads((out / "selection.json").read_text())
+
+
+def state_of(folder):
+    """Every file of a folder with its content."""
+    return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_a_transforms_json_keeps_all_but_the_frames_dropped(captures, tmp_path):
+    capture = captures / "nerfstudio"
+    path = capture / "transforms.json"
+    before = state_of(capture)
+    assert select(capture, tmp_path / "out", "--frames", "6") == 0
+    assert state_of(capture) == before
+    old, new = (
+        json.loads((p / "transforms.json").read_text()) for p in (capture, tmp_path / "out")
+    )
+    assert {k: v for k, v in old.items() if k != "frames"} == {
+        k: v for k, v in new.items() if k != "frames"
+    }
+    kept = set(record_of(tmp_path / "out")["kept"])
+    assert len(kept) == 6
+    is_kept = [p.name in kept for p in read_transforms(path).image_paths]
+    assert new["frames"] == [f for f, stays in zip(old["frames"], is_kept, strict=True) if stays]
+    again = open_capture(tmp_path / "out").source
+    for i, image in enumerate(again.image_paths):
+        assert image.is_symlink()
+        assert again.frame(i).rgb.shape == (LENS.height, LENS.width, 3)
+    assert (tmp_path / "out" / "selection.html").exists()
+
+
+def test_a_colmap_model_keeps_what_its_images_still_see(captures, tmp_path):
+    capture = captures / "colmap"
+    out = tmp_path / "out"
+    arguments = ["select", str(capture), "--out", str(out), "--frames", "8", "--copy"]
+    assert main(arguments) == 0
+    old, new = (read_model(find_model(path)) for path in (capture, out))
+    kept = set(record_of(out)["kept"])
+    assert {image.name for image in new.images} == kept
+    ids = {image.id for image in new.images}
+    old_seen = dict(zip(old.points.ids.tolist(), tracks(old), strict=True))
+    for number, track in zip(new.points.ids.tolist(), tracks(new), strict=True):
+        assert track == [element for element in old_seen[number] if element[0] in ids]
+        assert track
+    known = set(new.points.ids.tolist())
+    for image in new.images:
+        assert set(image.point_ids[image.point_ids >= 0].tolist()) <= known
+    for name in kept:
+        assert (out / "images" / name).read_bytes() == (capture / "images" / name).read_bytes()
+        assert not (out / "images" / name).is_symlink()
+
+
+def tracks(model):
+    """(image, keypoint) pairs of each point."""
+    pairs = np.stack([model.points.track_images, model.points.track_keypoints], axis=1).tolist()
+    ends = np.cumsum(model.points.track_lengths)
+    return [
+        [tuple(pair) for pair in pairs[end - length : end]]
+        for end, length in zip(ends, model.points.track_lengths, strict=True)
+    ]
+
+
+@pytest.mark.slow
+def test_pycolmap_reads_the_reduced_model_of_a_real_capture(tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    capture = shared_path("recordings", "banana")
+    assert main(["select", str(capture), "--out", str(tmp_path / "out"), "--frames", "6"]) == 0
+    model = pycolmap.Reconstruction(str(find_model(tmp_path / "out")))
+    assert model.num_reg_images() == 6
+    assert all(point.track.length() >= 1 for point in model.points3D.values())
+
+
+def test_a_recording_becomes_a_transforms_json_with_depth(captures, tmp_path):
+    assert select(captures / "recording", tmp_path / "out", "--share", "0.25") == 0
+    old = open_capture(captures / "recording", "z").source
+    new = read_transforms(tmp_path / "out")
+    assert len(new) == 4
+    names = [path.name for path in old.image_paths]
+    for i, path in enumerate(new.image_paths):
+        at = names.index(path.name)
+        np.testing.assert_allclose(new.poses[i], old.poses[at], atol=1e-6)
+        np.testing.assert_allclose(new.depth(i), old.depth(at), atol=1e-3)
+
+
+def test_the_same_folder_is_written_again_but_nothing_that_is_not_ours(captures, tmp_path):
+    out = tmp_path / "out"
+    for count in (8, 3):
+        assert select(captures / "nerfstudio", out, "--frames", str(count)) == 0
+    assert len(list((out / "images").iterdir())) == 3
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thesis.txt").write_text("mine")
+    assert select(captures / "nerfstudio", tmp_path / "other", "--frames", "3") == 2
+
+
+def test_more_frames_than_there_are_keep_all_and_it_is_said(captures, tmp_path):
+    assert select(captures / "recording", tmp_path / "out", "--frames", "60") == 0
+    record = record_of(tmp_path / "out")
+    assert len(record["kept"]) == 16
+    assert any("60" in note and "16" in note for note in record["notes"])
+
+
+def test_frames_that_must_stay_stay(captures, tmp_path):
+    names = open_capture(captures / "recording", "z").source.image_paths
+    words = ("--frames", "3", "--keep", names[5].name, names[6].stem)
+    assert select(captures / "recording", tmp_path / "out", *words) == 0
+    assert {names[5].name, names[6].name} <= set(record_of(tmp_path / "out")["kept"])
+
+
+@pytest.mark.parametrize(("words", "named"), [
+    (("--frames", "3", "--share", "0.5"), "--share"),
+    (("--frames", "0"), "--frames"),
+    (("--gain", "1.5"), "--gain"),
+    (("--keep", "nobody.png"), "nobody.png"),
+    (("--targets", "no_such_file.json"), "no_such_file.json"),
+])  # fmt: skip
+def test_what_cannot_be_done_is_one_line_with_its_option(captures, tmp_path, capsys, words, named):
+    assert select(captures / "recording", tmp_path / "out", *words) == 2
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert named in said
+    assert not (tmp_path / "out" / "selection.json").exists()
+
+
+def test_targets_may_be_a_path_but_not_outside_of_the_capture(captures, tmp_path, capsys):
+    inside = np.stack([pose_at([2.0, 1.5, 1.2], [4.0, 1.5, 1.2])])
+    write_camera_path(tmp_path / "in.json", inside, LENS.camera)
+    words = ("--frames", "3", "--targets", str(tmp_path / "in.json"))
+    assert select(captures / "recording", tmp_path / "in", *words) == 0
+    assert record_of(tmp_path / "in")["num_targets"] == 1
+    outside = np.stack([pose_at([100.0, 1.5, 1.2], [104.0, 1.5, 1.2])])
+    write_camera_path(tmp_path / "out.json", outside, LENS.camera)
+    words = ("--frames", "3", "--targets", str(tmp_path / "out.json"))
+    assert select(captures / "recording", tmp_path / "out", *words) == 2
+    assert "out.json" in capsys.readouterr().err
+
+
+def test_two_scenes_are_kept_in_proportion_and_it_is_said(captures, tmp_path):
+    poses = round_poses()
+    both = np.concatenate([poses, poses[::2]])
+    write_recording(tmp_path / "both", np.concatenate([poses, poses[::2]]))
+    both[16:, 0, 3] += 30.0
+    np.savetxt(tmp_path / "both" / "poses.txt", both.reshape(-1, 16), fmt="%.17g")
+    assert select(tmp_path / "both", tmp_path / "out", "--frames", "6") == 0
+    record = record_of(tmp_path / "out")
+    numbers = [int(name.partition(".")[0]) for name in record["kept"]]
+    assert sum(number < 16 for number in numbers) == 4
+    assert record["scenes"] == 2
+    assert any("2 scenes" in note for note in record["notes"])
+
+
+def test_frames_that_share_nothing_are_refused(tmp_path, capsys):
+    poses = round_poses(8)[::4]
+    poses[1, :3, 3] += [40.0, 0.0, 0.0]
+    write_recording(tmp_path / "apart", round_poses(8)[::4])
+    np.savetxt(tmp_path / "apart" / "poses.txt", poses.reshape(-1, 16), fmt="%.17g")
+    assert select(tmp_path / "apart", tmp_path / "out", "--frames", "1") == 2
+    assert "same surface" in capsys.readouterr().err
+
+
+def test_pictures_without_poses_are_refused(tmp_path, capsys):
+    (tmp_path / "photos").mkdir()
+    for i in range(3):
+        Image.new("RGB", (32, 24), (90, 80, 20 * i)).save(tmp_path / "photos" / f"{i}.png")
+    assert select(tmp_path / "photos", tmp_path / "out", "--frames", "2") == 2
+    assert "photos" in capsys.readouterr().err
+
+
+def test_twins_are_left_out_and_named(captures, tmp_path):
+    poses = round_poses()
+    write_recording(tmp_path / "twins", np.concatenate([poses, poses[3:4]]))
+    assert select(tmp_path / "twins", tmp_path / "out", "--drop-duplicates") == 0
+    record = record_of(tmp_path / "out")
+    assert len(record["kept"]) == 16
+    assert list(record["dropped"].values()) == ["twin of 003.png"]
+
+
+def test_of_a_video_sharp_frames_are_written_and_nothing_else_is_promised(tmp_path, capsys):
+    wide = np.random.default_rng(0).integers(0, 255, (36, 400, 3)).repeat(4, 0).repeat(4, 1)
+    walk = [wide[:, x : x + 192].astype(np.uint8) for x in range(0, 800, 16)]
+    (tmp_path / "walk.mp4").write_bytes(video(walk))
+    words = ["select", str(tmp_path / "walk.mp4"), "--out", str(tmp_path / "out")]
+    assert main([*words, "--frames", "5"]) == 0
+    pictures = sorted((tmp_path / "out" / "images").iterdir())
+    assert len(pictures) == 5
+    assert "not known yet" in " ".join(capsys.readouterr().out.split())
+    assert main([*words, "--share", "0.5"]) == 2
+    assert "--frames" in capsys.readouterr().err
