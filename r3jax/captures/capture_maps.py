@@ -212,7 +212,7 @@ def grown(state: MapState, frame: Frame, drop_edges: bool, max_range: float = RA
     """Returns the map with a frame's pixels, in a larger table where it needs one.
 
     Raises:
-        ValueError: so many voxels that they are surely too small.
+        ValueError: more voxels than any sensible voxel size would give.
     """
     arguments = frame, jnp.float32(max_range), jnp.asarray(drop_edges)
     try:

@@ -1,6 +1,6 @@
 """Chooses frames one after the other, each for what it adds to the targets' renderability.
 
-Lazy greedy: R is not submodular (a direction that closes kappa's box is worth more after its
+Lazy greedy: R is not submodular (a direction that closes kappa's box is more useful after its
 counterpart), so that an old gain is no exact bound. `is_exact` evaluates every candidate before
 each choice; docs/howto/select.md says how often the two differ.
 

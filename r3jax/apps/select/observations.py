@@ -54,7 +54,7 @@ class Observed:
     """Mean color of the frame's pixels, [m, 3] float32."""
 
     is_colored: np.ndarray
-    """False where no pixel fell into the voxel, which was seen all the same, [m]."""
+    """False where no pixel fell into the voxel, which was seen anyway, [m]."""
 
     def __len__(self) -> int:
         """Returns number of frames."""
@@ -120,7 +120,7 @@ def map_frames(
         drop_edges: False lets pixels on depth edges in.
 
     Raises:
-        ValueError: so many voxels that they are surely too small.
+        ValueError: more voxels than any sensible voxel size would give.
     """
     whole = empty_map(_CAPACITY, voxel_size)
     for frame in frames:

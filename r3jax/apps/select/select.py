@@ -26,7 +26,7 @@ from r3jax.captures.camera_paths import path_of
 from r3jax.captures.capture_maps import join_frame, join_on_rows, map_grid
 from r3jax.captures.faults.blocks import BlockImage, block_image
 from r3jax.captures.source import Picture, Source, thinned
-from r3jax.captures.standpoints import standpoints_of
+from r3jax.captures.standpoints import places_of
 from r3jax.captures.survey import RANGE, Survey, survey_of
 from r3jax.errors import InputError
 from r3jax.formats.errors import FormatError
@@ -260,7 +260,10 @@ def _targets(
     elif settings.targets == STAND:
         grid = map_grid(source, survey, used)
         stood = survey.alignment.points(source.poses[used, :3, 3])
-        places = standpoints_of(whole, grid, stood, STANDPOINTS, source.is_dense)
+        meter = survey.alignment.scale if source.is_metric else None
+        places = places_of(
+            whole, grid, stood, STANDPOINTS, is_dense=source.is_dense, meter=meter
+        ).standing
         angles = 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
         level = np.stack([np.cos(angles), np.sin(angles), np.zeros(_DIRECTIONS)], axis=1)
         poses = poses_along(
@@ -320,8 +323,7 @@ def _notes(found: Selected, targets: Targets, num_unread: int) -> tuple[str, ...
     settings, used, notes = found.settings, found.used, list[str]()
     if settings.frames is not None and settings.frames > len(used):
         notes.append(
-            f"{settings.frames} frames were asked for, and the capture has {len(used)}: all are "
-            "kept."
+            f"{settings.frames} frames are wanted, and the capture has {len(used)}: all are kept."
         )
     if num_unread:
         notes.append(f"{num_unread} frames cannot be read and are left out.")

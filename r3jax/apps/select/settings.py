@@ -6,7 +6,7 @@ from r3jax.captures.settings import SurveySettings, at_least
 from r3jax.errors import InputError
 
 DEFAULT_GAIN = 0.95
-"""Share of what all frames give at which the choice ends, where nothing else is asked for."""
+"""Share of what all frames give at which the choice ends, by default."""
 
 FRAMES, STAND = "frames", "stand"
 """Targets: the capture's own frames, and views from where people could stand."""

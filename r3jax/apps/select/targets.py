@@ -43,7 +43,7 @@ class Targets:
     """[P] int32."""
 
     weight: np.ndarray
-    """Share of the target's pixels that show the row, [P] float32; what they lack is unseen."""
+    """Share of the target's pixels that show the row, [P] float32; the rest is not known."""
 
     def __len__(self) -> int:
         """Returns number of targets."""

@@ -87,7 +87,7 @@ class Observations(NamedTuple):
     """[m, 3] float32."""
 
     is_colored: Any
-    """False where no pixel fell into the voxel, which was seen all the same, [m]."""
+    """False where no pixel fell into the voxel, which was seen anyway, [m]."""
 
 
 class Targets(NamedTuple):
