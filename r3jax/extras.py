@@ -5,6 +5,7 @@ from contextlib import contextmanager
 
 EXTRAS = {
     "embreex": "sim",
+    "gymnasium": "gym",
     "jaxopt": "refine",
     "jinja2": "plots",
     "matplotlib": "plots",
