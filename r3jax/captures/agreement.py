@@ -297,7 +297,7 @@ def check_agreement(images: Sequence[DepthImage]) -> None:
 def _explained(
     pictures: list[_Image], found: _Agreement
 ) -> tuple[Mistake, np.ndarray, _Agreement] | None:
-    """The mistake that explains a contradiction clearly, its size, and how the rest agrees."""
+    """Finds the mistake that clearly explains a contradiction, its size, and the agreement left."""
     best: tuple[Mistake, np.ndarray, _Agreement] | None = None
     overlaps = found.compared >= _FEWEST_POINTS
     score = found.score if overlaps else 0.0

@@ -96,7 +96,7 @@ class Ground:
         return np.percentile(self._levels[near], _FLOOR_PERCENTILE, axis=1)
 
     def footing(self, places: np.ndarray) -> Footing:
-        """Finds who stands where to hold the camera at each of the places [c, 3]."""
+        """Finds where a person stands to hold the camera at each of the places [c, 3]."""
         floor = self.floor(places)
         stands = self._stands(places, floor)
         feet = np.full((len(places), 3), np.nan)
@@ -187,7 +187,7 @@ def ground_of(
 
 
 def _refined(tops: np.ndarray, voxels: np.ndarray, cameras: np.ndarray, cell: float) -> np.ndarray:
-    """Height of what lies below each camera, [n], from the voxels in the cells that end at `tops`.
+    """Refines the height below each camera, [n], by the voxels in the cells that end at `tops`.
 
     A cell is as high as a step of a staircase; a floor that fills two of them lies in the lower.
     """

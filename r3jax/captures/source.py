@@ -186,7 +186,7 @@ _SLACK = 1.05
 def sparse_depth(
     camera: Camera, pose: np.ndarray, xyz: np.ndarray, rgb: np.ndarray, *, hides: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """z-depth [H, W] float32 of the points that an image shows, and their colors [H, W, 3] uint8.
+    """Projects the points that an image shows: z-depth [H, W] float32 and colors [H, W, 3] uint8.
 
     Args:
         camera: of the image.
@@ -439,7 +439,7 @@ def _read_dense(images: PosedImages, index: int, stride: int, has_images: bool) 
 
 
 def _thinned_colors(images: PosedImages, index: int, stride: int) -> tuple[np.ndarray, np.ndarray]:
-    """Colors [h, w, 3] uint8 of a thinned image, and which pixels it has, [h, w]."""
+    """Reads colors [h, w, 3] uint8 of a thinned image, and the mask of its pixels, [h, w]."""
     table = sampling_table(images.lenses[index], stride)
     rgb, mask = images.masked_rgb(index)
     return table.take(rgb), table.is_there if mask is None else table.take(mask)

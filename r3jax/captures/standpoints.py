@@ -143,7 +143,7 @@ def places_in_free_space(grid: OccupancyGrid, cameras: np.ndarray) -> np.ndarray
 
 
 def places_in_hull(cameras: np.ndarray, voxels: np.ndarray) -> np.ndarray:
-    """Places between the cameras, away from all voxels, [c, 3] [audit units].
+    """Finds places between the cameras, away from all voxels, [c, 3] [audit units].
 
     Args:
         cameras: where the camera was, [n, 3].

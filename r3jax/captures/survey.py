@@ -316,7 +316,7 @@ def _strays(source: Source, chosen: np.ndarray, depth: float) -> np.ndarray:
 def _up(
     source: Source, settings: SurveySettings, chosen: np.ndarray, images: Sequence[DepthImage]
 ) -> Vertical:
-    """The vertical as it was given, as the format says, or as cameras and surfaces suggest."""
+    """Chooses the vertical: as given, as in the format, or as cameras and surfaces suggest."""
     if settings.up is not None:
         return Vertical(up_of(settings.up))
     if source.up is not None:

@@ -188,7 +188,7 @@ def _degrees(cosine: np.ndarray) -> np.ndarray:
 
 
 def _thinned(seen: Sequence[Normals]) -> Normals:
-    """Some normals, with weights that sum to the number of observations that they count for."""
+    """Draws some normals, with weights that sum to their number of observations."""
     if not sum(len(part.weight) for part in seen):
         return Normals(np.zeros((0, 3)), np.zeros(0), np.zeros(0))
     direction, weight, error = (np.concatenate(parts) for parts in zip(*seen, strict=True))
@@ -209,7 +209,7 @@ def _distinct(directions: np.ndarray, weight: np.ndarray) -> float:
 
 
 def _of_cameras(up: np.ndarray, rotations: np.ndarray) -> np.ndarray:
-    """Returns the c at directions [u, 3], for the cameras' axes [n, 3, 3]."""
+    """Computes C at directions [u, 3] from the cameras' axes [n, 3, 3]."""
     right, down, forward = np.moveaxis(np.einsum("ki,nij->knj", up, rotations), 2, 0)
 
     def level(sine: np.ndarray) -> np.ndarray:
@@ -229,7 +229,7 @@ def _of_cameras(up: np.ndarray, rotations: np.ndarray) -> np.ndarray:
 
 
 def _of_surfaces(up: np.ndarray, normals: Normals) -> np.ndarray:
-    """Returns the s at directions [u, 3]: densities on the sphere, their logarithms weighted."""
+    """Computes S at directions [u, 3]: the weighted logarithms of densities on the sphere."""
     cosine = up @ normals.direction.T
     variance = _EVEN**2 + normals.error**2
     cap = 1.0 / (2.0 * np.pi * variance)

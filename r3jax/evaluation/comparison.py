@@ -191,7 +191,7 @@ def view_values(cell: Cell, metric: str) -> np.ndarray | None:
 
 
 def scores_by_method(cells: Sequence[Cell], metric: str) -> dict[str, dict[str, np.ndarray]]:
-    """Per method and scene the values of one metric, [seeds, views], seeds in ascending order.
+    """Collects a metric's values by method and scene, [seeds, views], seeds ascending.
 
     Records without the metric are left out, and so are scenes and methods without records.
 
@@ -211,7 +211,7 @@ def scores_by_method(cells: Sequence[Cell], metric: str) -> dict[str, dict[str, 
 
 
 def seeds_by_method(cells: Sequence[Cell]) -> dict[str, dict[str, list[int]]]:
-    """Per method and scene the seeds there are, ascending; an empty list where there are none."""
+    """Collects the seeds by method and scene, ascending; an empty list where there are none."""
     scenes = scenes_of(cells)
     seeds: dict[str, dict[str, list[int]]] = {
         method: {scene: [] for scene in scenes} for method in methods_of(cells)

@@ -153,7 +153,7 @@ def _caption(row: ViewRow) -> str:
 
 
 def _color_bar(figure: Figure, image: AxesImage, axes: Axes, label: str) -> None:
-    """A bar below a column of images."""
+    """Draws a bar below a column of images."""
     bar = figure.colorbar(image, cax=axes, orientation="horizontal")
     bar.outline.set_visible(False)
     bar.set_ticks(list(np.linspace(*image.get_clim(), 3)))

@@ -108,7 +108,7 @@ def evaluate(
 
 
 def _check_scene(scene: GaussianScene) -> None:
-    """Rasterizers leave out what is not a number; scored like that, a broken scene looks whole."""
+    """Refuses parameters that are not finite: rasterizers skip them, and hide the damage."""
     finite = np.ones(scene.capacity, dtype=bool)
     for values in jax.tree.leaves(scene):
         finite &= np.isfinite(np.asarray(values)).reshape(scene.capacity, -1).all(axis=1)

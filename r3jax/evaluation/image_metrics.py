@@ -59,7 +59,7 @@ _C1, _C2 = 0.01**2, 0.03**2
 
 
 def to_8_bits(images: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Images as an 8-bit file would hold them: clipped to [0, 1], rounded to 1/255."""
+    """Rounds images as an 8-bit file does: clipped to [0, 1], in steps of 1/255."""
     return jnp.round(jnp.clip(images, 0.0, 1.0) * 255.0) / 255.0
 
 

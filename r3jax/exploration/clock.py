@@ -22,7 +22,7 @@ class Clock(Protocol):
         ...
 
     def charge(self, stage: str, measured: float) -> float:
-        """Returns seconds on the mission clock for one call of a stage that took `measured` [s]."""
+        """Returns the seconds to charge for one call of a stage that took `measured` [s]."""
         ...
 
 

@@ -79,7 +79,7 @@ def probe_poses(grid: OccupancyGrid, num: int) -> np.ndarray:
 
 
 def _poses_along(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """`geometry.cameras.pose_along` for many on the host, where their number may vary freely."""
+    """Computes `geometry.cameras.pose_along` for many on the host, where their number may vary."""
     # Camera axes: x right and level, y down, z forward.
     right = np.stack([directions[:, 1], -directions[:, 0], np.zeros(len(directions))], axis=1)
     right /= np.linalg.norm(right, axis=1, keepdims=True)  # never 0: no probe looks straight up

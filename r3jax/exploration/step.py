@@ -159,7 +159,7 @@ def _depart(
 
 
 def _plan_ahead(state: LoopState, mission: Mission, leg: Leg) -> tuple[LoopState, float]:
-    """The state with the decision for when the camera has flown a path, and the seconds it took.
+    """Decides for the end of a path in advance; returns the state, and the seconds it took.
 
     The decision takes the view at the end of the path as taken, and nothing of those captured
     while moving: their directions are found later, from frame to frame.

@@ -143,7 +143,7 @@ def fork_run(
 
 
 def _refuse_half_a_fork(run: Run) -> None:
-    """A fork that was cut off while it took views over would go its own way too early."""
+    """Refuses a fork that was cut off while it took views over: it would diverge too early."""
     parent = run.header.parent or {}
     wanted = parent.get("views", 0) if "forked" in parent else 0
     if len(run.rows) < wanted:

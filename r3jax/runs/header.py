@@ -108,7 +108,7 @@ def camera_fields(camera: Camera) -> dict[str, int | float]:
 
 
 def plain_settings(settings: Any) -> Any:
-    """Nested settings (dataclasses, modules, arrays) as what JSON can hold."""
+    """Converts nested settings (dataclasses, modules, arrays) to plain values for JSON."""
     # vars, not asdict: that would copy arrays and stop at modules.
     if isinstance(settings, eqx.Module) or dataclasses.is_dataclass(settings):
         return {name: plain_settings(value) for name, value in vars(settings).items()}
@@ -122,7 +122,7 @@ def plain_settings(settings: Any) -> Any:
 def policy_fields(policy: Policy) -> dict[str, Any]:
     """Describes a policy as a header does: its name, its settings, and the class of a plug-in.
 
-    Of a program also what it is held to on this system.
+    For an external program they include its isolation on this system.
     """
     fields = {"name": policy.name, "settings": settings_of(policy)}
     if isinstance(policy, LivesOutside):

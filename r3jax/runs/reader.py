@@ -184,7 +184,7 @@ def complete_lines(path: Path) -> list[str]:
 
 
 def _read_timings(path: Path) -> tuple[dict[str, float], ...]:
-    """Timings are a by-product: what cannot be read of them is left out."""
+    """Reads the timings, leaving out lines that cannot be read: they are a by-product."""
     # Merged runs have none, and a process may have been killed before it wrote any.
     if not path.exists():
         return ()

@@ -72,7 +72,7 @@ def _last(
     frames: Iterable[tuple[Run, int]],
     on_frame: Callable[[], None] = lambda: None,
 ) -> tuple[MapState, OccupancyGrid]:
-    """The map and the grid after all frames of several runs, each given by its run and number."""
+    """Rebuilds the map and the grid after all frames, each given by its run and number."""
     # Before the first frame: mapping takes minutes, and a misfit is reported at once.
     for run in runs[1:]:
         check_alike(runs[0], run)
@@ -214,7 +214,7 @@ def starts_of(run: Run) -> list[np.ndarray]:
 
 
 def check_alike(first: Run, other: Run) -> None:
-    """Runs can be merged if they mapped the same scene on the same terms."""
+    """Refuses runs that did not map the same scene on the same terms."""
     a, b = first.header, other.header
     terms = [
         ("the scene", a.scene.get("hash"), b.scene.get("hash")),

@@ -120,7 +120,7 @@ def table_of(name: str, values: Any, shape: tuple[int, int]) -> np.ndarray:
 
 
 def shortest_floats(array: np.ndarray) -> list[Any]:
-    """Nested lists of the shortest decimals that read back as the same float32 numbers."""
+    """Makes nested lists of the shortest decimals that read back as the same float32 numbers."""
     if array.ndim > 1:
         return [shortest_floats(part) for part in array]
     # str of a float32 is its shortest decimal; as a float64 it would drag along digits of noise.

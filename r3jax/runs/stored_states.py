@@ -92,7 +92,7 @@ class CheckpointWriter:
         return True
 
     def wait(self) -> None:
-        """Returns when what was begun is whole.
+        """Waits until the checkpoint in progress is complete.
 
         Raises:
             OSError: it could not be written.

@@ -236,7 +236,7 @@ class RunWriter:
     def checkpoint(self, step: int, tables: Tables, *, wait: bool = False) -> None:
         """Stores the state after view `step` (`stored_states.state_tables`) in the background.
 
-        Left out if the state before is still being stored, unless `wait` is True.
+        It is skipped if the state before is still being stored, unless `wait` is True.
 
         Raises:
             RecordingStopped: the disk refused the checkpoint before, or with `wait` this one.

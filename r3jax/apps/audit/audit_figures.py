@@ -74,7 +74,7 @@ def frames_figure(audit: Audit) -> Figure:
 
 
 def gain_figure(audit: Audit) -> Figure:
-    """Mean renderability of all surfaces after each suggested view, and after random ones."""
+    """Draws the mean renderability of all surfaces after suggested views, and after random ones."""
     figure = style.new_figure(10.0, 2.7)
     axes = style.dress(
         figure.subplots(), "What the views promise", "views taken", "mean R of the surfaces"
@@ -148,12 +148,12 @@ def view_pictures(audit: Audit, view: Suggestion, way: Way) -> list[tuple[Figure
 
 
 def _photo(audit: Audit, index: int) -> Figure:
-    """An image of the capture."""
+    """Draws an image of the capture."""
     return _picture(audit.source.read(index)[0])
 
 
 def _picture(picture: np.ndarray) -> Figure:
-    """One image, as colors or as renderability, without anything round it."""
+    """Draws one image, as colors or as renderability, without a frame."""
     figure = style.new_figure(_SIDE, _SIDE * picture.shape[0] / picture.shape[1])
     figure.set_layout_engine("none")
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
@@ -167,7 +167,7 @@ def _picture(picture: np.ndarray) -> Figure:
 
 
 def _draw_turn(axes: Axes, turn: float) -> None:
-    """An arrow to the side to which to turn [deg], longer for a larger turn."""
+    """Draws an arrow to the side to which to turn [deg], longer for a larger turn."""
     if abs(turn) < 10.0:
         return
     reach = 0.12 + 0.3 * min(abs(turn), 180.0) / 180.0
@@ -181,7 +181,7 @@ def _draw_turn(axes: Axes, turn: float) -> None:
 
 
 def _draw_target(axes: Axes, audit: Audit, view: Suggestion, index: int) -> None:
-    """A ring round the middle of what a view shows, in an image of the capture."""
+    """Draws a ring around the middle of what a view shows, in an image of the capture."""
     pose = audit.survey.alignment.poses(audit.source.poses[[index]])[0]
     centers = np.asarray(audit.seen.state.center, np.float64).T[view.shown]
     found = projected(audit.source.camera(index), pose, centers, _NEAREST)
@@ -229,7 +229,7 @@ def worst_figure(audit: Audit, count: int = 4) -> Figure:
 def _pictures(
     state: MapState, audit: Audit, pose: np.ndarray, config: ScoringConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean colors [h, w, 3] and renderability [h, w] (NaN without a voxel) of a view of a map."""
+    """Renders mean colors [h, w, 3] and renderability [h, w] (else NaN) of a view of a map."""
     seen = term_images(state, audit.camera, jnp.asarray(pose, dtype=jnp.float32), config)
     row = np.asarray(seen.row)
     is_hit = row < state.capacity

@@ -100,7 +100,7 @@ def bad_regions(state: MapState, diagnosis: Diagnosis, most: int = MOST) -> list
 
 
 def _worst_block(points: np.ndarray, loss: np.ndarray) -> np.ndarray:
-    """The point in the middle of those in the block of a regular division that loses most, [3]."""
+    """Finds the middle point in the block of a regular division that loses most, [3]."""
     index = np.floor(points / BLOCK).astype(np.int64)
     _, block = np.unique(index, axis=0, return_inverse=True)
     block = block.reshape(-1)

@@ -251,7 +251,7 @@ def score_from_standpoints(
 
     Args:
         state: the map; its surfaces are those of the demand.
-        demand: who asks.
+        demand: the standpoints, and the voxels that each sees.
         focal: focal length of the camera that would render [px], in the map's unit.
         config: of the closed forms.
     """
@@ -304,7 +304,7 @@ def diagnose(state: MapState, demand: Demand, answers: StandpointScores) -> Diag
     Args:
         state: the map.
         demand: who was asked.
-        answers: what they say of this map.
+        answers: their scores of this map.
     """
     count = np.asarray(demand.num_seen)
     value = np.asarray(jnp.sum(answers.value, axis=0)) / np.maximum(count, 1.0)

@@ -105,14 +105,14 @@ def steps_between(here: np.ndarray, there: np.ndarray, meter: float, unit: str =
 
 
 def turn_between(here: np.ndarray, there: np.ndarray) -> float:
-    """Angle in the plane from one view's axis to another's, positive to the left [deg]."""
+    """Computes the angle in the plane between two views' axes, positive to the left [deg]."""
     forward, ahead = _ahead(here), _ahead(there)
     across = forward[0] * ahead[1] - forward[1] * ahead[0]
     return float(np.degrees(np.arctan2(across, forward @ ahead)))
 
 
 def _ahead(pose: np.ndarray) -> np.ndarray:
-    """The axis of a view in the plane, [2]; of one that looks up or down its upper edge."""
+    """Returns the axis of a view in the plane, [2]; if it looks up or down, its upper edge."""
     axis = pose[:3, 2] if np.hypot(*pose[:2, 2]) > 0.05 else -pose[:3, 1]
     return axis[:2] / np.hypot(*axis[:2])
 
@@ -168,13 +168,13 @@ def way_to(source: Source, survey: Survey, seen: Seen, view: Suggestion) -> Way:
 
 
 def _reach(feet: np.ndarray, pose: np.ndarray, meter: float, unit: str) -> str:
-    """The words for a camera that is held over something."""
+    """Describes a camera that is held over something."""
     out = float(np.linalg.norm(pose[:2, 3] - feet[:2, 3])) / meter
     return f"hold the camera {spoken_length(out, unit)} out over what stands there"
 
 
 def _nearest(poses: np.ndarray, seen: Seen, view: Suggestion) -> tuple[int, bool]:
-    """Number of the nearest picture, by place and then by heading; True if the line is blocked."""
+    """Finds the nearest picture, by place and then by heading; True if the line is blocked."""
     eye = view.pose[:3, 3]
     origin, cell = np.asarray(seen.grid.origin, np.float64), float(seen.grid.cell_size)
     is_blocked = ~segments_are_inside(
@@ -188,7 +188,7 @@ def _nearest(poses: np.ndarray, seen: Seen, view: Suggestion) -> tuple[int, bool
 
 
 def _landmark(poses: np.ndarray, pose: np.ndarray, start: int) -> int | None:
-    """Number of a picture taken near by that looks where the view looks; None: there is none."""
+    """Finds a picture taken near by that looks where the view looks, or None."""
     angle = np.degrees(np.arccos(np.clip(poses[:, :3, 2] @ pose[:3, 2], -1.0, 1.0)))
     gap = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1)
     angle = np.where(gap <= _NEAR_BY, angle, np.inf)

@@ -85,7 +85,7 @@ _PALE = 0.55
 
 
 def plan_figure(audit: Audit) -> Figure:
-    """Map of regions, frames and suggested views, to be read on a phone."""
+    """Draws a map of regions, frames and suggested views, to be read on a phone."""
     height = _height(audit)
     picture, extent = floor_picture(audit.seen.state, audit.seen.grid, height)
     figure, axes, size = _map(audit, height)
@@ -105,7 +105,7 @@ def plan_figure(audit: Audit) -> Figure:
 
 
 def value_figure(audit: Audit) -> Figure:
-    """Map of the renderability of all surfaces."""
+    """Draws a map of the renderability of all surfaces."""
     height = _height(audit)
     figure, axes, _ = _map(audit, height)
     unit = 1.0 / audit.survey.alignment.scale
@@ -124,12 +124,12 @@ def _scaled(extent: Extent, unit: float) -> Extent:
 
 
 def _height(audit: Audit) -> float:
-    """Typical height of the cameras."""
+    """Returns the typical height of the cameras."""
     return float(np.median([frame.pose[2, 3] for frame in audit.frames]))
 
 
 def _map(audit: Audit, height: float) -> tuple[Figure, Axes, np.ndarray]:
-    """An empty map of the place, and its size [2] [audit units]."""
+    """Makes an empty map of the place; returns also its size [2] [audit units]."""
     low, high = _used(audit, height)
     size = high - low
     figure = style.new_figure(_WIDTH, float(np.clip(_WIDTH * size[1] / size[0] + 0.5, 3.0, 11.0)))
@@ -173,7 +173,7 @@ def _used(audit: Audit, height: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _below(audit: Audit, height: float) -> tuple[np.ndarray, np.ndarray]:
-    """Centers [m, 3] of the evaluated voxels below the cut, and their renderability [m]."""
+    """Selects the evaluated voxels below the cut: centers [m, 3] and renderability [m]."""
     state, found = audit.seen.state, audit.diagnosis
     centers = np.asarray(state.center, np.float64).T
     is_below = found.is_seen & (centers[:, 2] < height + _HEADROOM)
@@ -183,7 +183,7 @@ def _below(audit: Audit, height: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _value_picture(audit: Audit, height: float) -> tuple[np.ndarray, Extent]:
-    """Mean renderability of the columns of voxels, [x, y], NaN without any; and its extent."""
+    """Averages renderability over columns of voxels, [x, y], else NaN; returns also its extent."""
     centers, values = _below(audit, height)
     low, high = np.percentile(centers[:, :2], [0.2, 99.8], axis=0)
     size = max(audit.survey.voxel_size, float((high - low).max()) / _MOST_PIXELS)
@@ -201,7 +201,7 @@ def _value_picture(audit: Audit, height: float) -> tuple[np.ndarray, Extent]:
 
 
 def _draw_scale(axes: Axes, audit: Audit) -> None:
-    """A bar as long as a unit of the capture, or a round number of them."""
+    """Draws a bar as long as a unit of the capture, or a round number of them."""
     left, right = axes.get_xlim()
     bottom, top = axes.get_ylim()
     length = 10.0 ** np.floor(np.log10(max(right - left, 1e-9) / 2.0))
@@ -214,7 +214,7 @@ def _draw_scale(axes: Axes, audit: Audit) -> None:
 
 
 def _draw_path(axes: Axes, audit: Audit, unit: float) -> None:
-    """The evaluated frames: a line in their order, a dot each, colored by renderability."""
+    """Draws the evaluated frames: a line in their order, a dot each, colored by renderability."""
     places = unit * np.stack([frame.pose[:2, 3] for frame in audit.frames])
     ahead = np.stack([frame.pose[:2, 2] for frame in audit.frames])
     axes.plot(*places.T, color=style.INK, linewidth=0.8, alpha=0.35, zorder=2)
@@ -230,7 +230,7 @@ def _draw_path(axes: Axes, audit: Audit, unit: float) -> None:
 
 
 def _draw_regions(axes: Axes, audit: Audit, unit: float) -> None:
-    """Bad regions as lettered circles in the color of their cause; unseen ones dotted."""
+    """Draws bad regions as lettered circles in the color of their cause; unseen ones dotted."""
     numbered = list(enumerate(audit.all_regions))
     named = [
         *[item for item in numbered if item[1].is_known][:LETTERED],
@@ -260,7 +260,7 @@ def _draw_regions(axes: Axes, audit: Audit, unit: float) -> None:
 
 
 def _labels(regions: list[tuple[int, Region]]) -> list[tuple[np.ndarray, str, str]]:
-    """Where to write which letters in which color: regions above each other share a place."""
+    """Chooses place, text and color of each label: regions above each other share one."""
     places: list[tuple[np.ndarray, str, str]] = []
     for number, region in regions:
         center = region.center[:2]
@@ -295,7 +295,7 @@ def apart(places: np.ndarray, least: float) -> np.ndarray:
 
 
 def _draw_views(axes: Axes, audit: Audit, unit: float, least: float) -> None:
-    """Suggested views: a wedge over the field of view, and numbers that do not cover each other."""
+    """Draws suggested views: a wedge over the field of view, and numbers that do not overlap."""
     camera = audit.camera
     half = float(np.arctan(0.5 * camera.width / float(camera.fx)))
     eyes = np.array([view.pose[:2, 3] for view in audit.plan.views]).reshape(-1, 2)

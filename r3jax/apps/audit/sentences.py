@@ -92,7 +92,7 @@ def two_digits(value: float) -> str:
 
 
 def point(position: np.ndarray) -> str:
-    """Coordinates, to be read."""
+    """Writes coordinates for the reader."""
     return ", ".join(f"{value:.2f}" for value in position)
 
 
@@ -248,7 +248,7 @@ def saturation() -> str:
 
 
 def listed(parts: list[str]) -> str:
-    """Words in a row: a, b and c."""
+    """Joins words: a, b and c."""
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
 
 
@@ -422,7 +422,7 @@ def advice(audit: Audit, titles: dict[str, str]) -> list[tuple[str, str]]:
 
 
 def _about_surfaces(audit: Audit) -> list[tuple[float, str, str]]:
-    """The suggested pictures, always among the things to do; or what else helps, by cause."""
+    """Advises to take the suggested pictures, or else a remedy for each cause."""
     missing = {cause: cause_share(audit, cause) for cause in _ORDINARY}
     told = sorted((c for c in missing if missing[c] >= _LEAST_TOLD), key=lambda c: -missing[c])
     if not audit.plan.views:
@@ -437,12 +437,12 @@ def _about_surfaces(audit: Audit) -> list[tuple[float, str, str]]:
 
 
 def _unknown(audit: Audit) -> str:
-    """Share of what the frames show of which nothing is known."""
+    """Returns the share of the frames' pixels whose surface is not known."""
     return f"{100 * audit.shares[NOT_KNOWN]:.0f} %"
 
 
 def region_letter(number: int) -> str:
-    """A, B, ... of the regions."""
+    """Returns the letter of a region: A, B, ..."""
     return chr(ord("A") + number) if number < 26 else str(number + 1)
 
 

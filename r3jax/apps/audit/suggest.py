@@ -80,8 +80,8 @@ def view_gains(
     Args:
         state: the map.
         grid: whose unexplored cells count, `config.lambda1` each.
-        demand: who asks.
-        answers: what they say of the map as it is.
+        demand: the standpoints, and the voxels that each sees.
+        answers: their scores of the map as it is.
         camera: of the views.
         poses: [C, 4, 4] [audit units].
         config: of all scores.
@@ -483,7 +483,7 @@ def _suggestion(
 def _random(
     state: MapState, task: Task, places: np.ndarray, num: int, seed: int
 ) -> tuple[float, ...]:
-    """Mean renderability after each of `num` views from random places in random directions."""
+    """Computes mean renderability after each of `num` random views."""
     if not num:
         return ()
     rng = np.random.default_rng(seed)

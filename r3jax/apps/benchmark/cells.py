@@ -169,7 +169,7 @@ def _motion(given: Any) -> Motion:
 
 
 def _further(given: dict[str, Any], config: type, own: tuple[str, ...]) -> dict[str, Any]:
-    """The given settings of a config that are not its defaults, in the order of its fields."""
+    """Returns the given settings that are not a config's defaults, in the order of its fields."""
     known = {field.name: field.default for field in fields(config) if field.name not in own}
     unknown = [name for name in given if name not in known]
     if unknown:

@@ -54,7 +54,7 @@ def reference_path(root: Path, scene_hash: str, set_hash: str, conditions: Condi
 def path_of_images(
     root: Path, scene_hash: str, set_hash: str, sizes: tuple[int, float, int]
 ) -> Path:
-    """Returns the same by resolution [px], field of view [deg] and resolution of training [px]."""
+    """Returns the path by resolution [px], field of view [deg] and resolution in training [px]."""
     what = [scene_hash, set_hash, *sizes]
     key = hashlib.sha256(json.dumps(what).encode()).hexdigest()[:16]
     return Path(root) / FOLDER / f"{key}.npz"

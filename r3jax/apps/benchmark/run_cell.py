@@ -118,7 +118,7 @@ def _run_locked(cell: Cell, root: Path, paths: CellPaths, on_stage: OnStage) -> 
 
 @contextlib.contextmanager
 def _lock(folder: Path) -> Generator[None]:
-    """One process at a time."""
+    """Locks the cell: one process at a time."""
     end = time.monotonic() + _LOCK_PATIENCE
     while True:
         try:
@@ -332,7 +332,7 @@ def _submission_fields(submission: Submission, run: Run) -> dict[str, Any]:
 def _train(
     cell: Cell, paths: CellPaths, run: Run, num_views: int, snapshot: str, on_stage: OnStage
 ) -> GaussianScene:
-    """Vanilla 3DGS from scratch on the first views, or on from the newest checkpoint."""
+    """Trains vanilla 3DGS on the first views, from scratch or from the newest checkpoint."""
     on_stage("reading its views")
     frames = (run.frame(step) for step in range(num_views))
     views = load_views(frames, cell.conditions.train_resolution)

@@ -299,7 +299,7 @@ def headings_of(groups: Sequence[Sequence[Cell]]) -> list[str]:
 
 
 def _terms_of_groups(groups: Sequence[Sequence[Cell]]) -> dict[str, dict[int, object]]:
-    """By term its value in each group that has one, by the group's number."""
+    """Collects each term's values by the number of the group."""
     found = [terms_of(group[0]) for group in groups]
     names = dict.fromkeys(name for terms in found for name in terms)
     values = {name: {n: terms.get(name) for n, terms in enumerate(found)} for name in names}

@@ -215,7 +215,7 @@ def expected_error_images(
     config: ScoringConfig | None = None,
     difficulty: Float[Array, " N"] | None = None,
 ) -> ErrorImages:
-    """Expects an error of every pixel of one view, in the pixels of `renderability_image`.
+    """Predicts the error of every pixel of one view, in the pixels of `renderability_image`.
 
     Arguments as in `error_terms`.
     """
@@ -232,7 +232,7 @@ def expected_error(
     config: ScoringConfig | None = None,
     difficulty: Float[Array, " N"] | None = None,
 ) -> ExpectedError:
-    """Expects a PSNR and an SSIM of one view, by the means of `expected_error_images`.
+    """Predicts PSNR and SSIM of one view from the means of `expected_error_images`.
 
     What a model of the frames in the map would reach there, trained as the benchmark's are. It
     ranks the views of a model; the level depends on the training. Written for one pose;
@@ -249,7 +249,7 @@ def expected_error(
 
 
 def expected_of_means(terms: Float[Array, " T"]) -> ExpectedError:
-    """Expects a PSNR and an SSIM from the terms' means over a view."""
+    """Predicts PSNR and SSIM from the terms' means over a view."""
     psnr = -10.0 * jnp.log10(_weighted(SQUARED, terms) + _LEAST)
     ssim = 1.0 - _weighted(DISSIMILARITY, terms)
     return ExpectedError(

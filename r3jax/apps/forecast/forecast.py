@@ -114,7 +114,7 @@ class Forecast:
         return statistic(self.mixture, name) if self.mixture.size else -np.inf
 
     def interval(self, name: str, level: float = 0.8) -> tuple[float, float]:
-        """Returns the interval of that probability [dB], by the errors in unknown scenes."""
+        """Returns the interval of probability `level` [dB], from the errors in unknown scenes."""
         value, width = self.value(name), self.calibration.half_width(name, level)
         return value - width, value + width
 
@@ -207,7 +207,7 @@ def stopping_rule(
 def is_done(planner: Planner, goal: str, camera: Camera | None = None) -> bool:
     """Judges whether a planner has seen enough, by the rule of `explore --until`.
 
-    Not at every decision: it takes as long as scoring a hundred views.
+    Do not call it at every decision: it takes as long as scoring a hundred views.
 
     Args:
         planner: what is known.

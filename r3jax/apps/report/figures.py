@@ -294,7 +294,7 @@ _SHOWN = (("mean", "mean of all views"), ("p10", "all but the worst tenth"))
 
 
 def outlook_figure(outlook: Outlook) -> Figure:
-    """Mean and p10 of the PSNR of free-space views against the views taken, with intervals."""
+    """Draws mean and p10 of the PSNR of free-space views, with intervals, by views taken."""
     figure = style.new_figure(10.0, 3.6)
     axes = figure.subplots()
     style.dress(

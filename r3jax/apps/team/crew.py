@@ -136,7 +136,7 @@ def resume_team(folder: Path, stack: contextlib.ExitStack, budget: str | None = 
 
 
 def _only_writer(folder: Path, stack: contextlib.ExitStack) -> None:
-    """Until the stack ends no other process writes this team."""
+    """Locks the team's folders against other processes until the stack ends."""
     own_folder(folder, "team", "give another --name")
     try:
         stack.enter_context(lock_folder(folder))
@@ -175,7 +175,7 @@ def _with_starts(
 
 
 def _check_leftovers(folder: Path, cameras: int) -> None:
-    """A smaller team must not be written over a larger one: whose run would the last one be?"""
+    """Refuses to write a smaller team over a larger one, whose last runs would remain."""
     check_own(folder, "team", "give another --name")
     if (folder / str(cameras)).exists():
         raise InputError(f"{folder} holds a team of more than {cameras}: give another --name")

@@ -76,11 +76,11 @@ class ReservedViews:
         self.name, self.config = self.policy.name, getattr(self.policy, "config", None)
 
     def init(self, camera: Camera, grid: OccupancyGrid, *, key: Array) -> Any:
-        """As the policy does."""
+        """Does what the policy does."""
         return self.policy.init(camera, grid, key=key)
 
     def observe(self, state: Any, map_state: MapState, frame: Frame) -> Any:
-        """As the policy does."""
+        """Does what the policy does."""
         return self.policy.observe(state, map_state, frame)
 
     def decide(
@@ -111,7 +111,7 @@ class ReservedViews:
         T_world_camera: np.ndarray,
         waypoints: np.ndarray,
     ) -> Any:
-        """As the policy does."""
+        """Does what the policy does."""
         return self.policy.follow(state, map_state, grid, T_world_camera, waypoints)
 
 
@@ -229,7 +229,7 @@ def last_meeting(seconds: float, meet_every: float) -> float:
 
 
 def in_order(observations: tuple[Observation, ...]) -> list[Observation]:
-    """By the clock; of two at the same time, the first member's comes first."""
+    """Sorts by the clock; of two at the same time, the first member's comes first."""
     return sorted(observations, key=attrgetter("seconds", "member"))
 
 

@@ -78,7 +78,7 @@ class LatestWorker(Generic[Question, Answer]):
             self._changed.notify_all()
 
     def wait(self, timeout: float) -> bool:
-        """Returns when the newest question is answered in full; False if it takes longer [s]."""
+        """Waits until the newest question is answered; returns False after a timeout [s]."""
         with self._changed:
             return self._changed.wait_for(lambda: self._done == self._asked, timeout)
 
@@ -133,7 +133,7 @@ class LatestWorker(Generic[Question, Answer]):
         return self._closed or self._asked != number
 
     def _tell(self, number: int, tell: Callable[[], None]) -> bool:
-        """Tells what came out; False if another question has been asked since."""
+        """Reports the result; returns False if there is a newer question."""
         with self._changed:
             is_newest = number == self._asked and not self._closed
             if is_newest:
@@ -254,13 +254,13 @@ class App:
         self.ask()
 
     def _ask_again(self) -> None:
-        """More is known of what is shown; what is shown stays right."""
+        """Repeats the question as more is known; what is shown stays right."""
         with self._lock:
             self._asked = Query(self.controls.settings, self.canvas.pose)
             self.worker.ask(self._asked)
 
     def _mark_stale(self, question: Query, *, camera: bool, view: bool, scene: bool) -> None:
-        """What is on the page belongs to another question: says so, part by part."""
+        """Marks each part of the page as belonging to another question."""
         step, layer = question.settings.step, question.settings.layer
         if camera:
             self.controls.mark_camera_stale()
@@ -274,7 +274,7 @@ class App:
             self.controls.show_busy(f"{what}: being computed", 0.0)
 
     def _tell(self, error: Exception) -> None:
-        """Something went wrong: the requested view will not appear."""
+        """Reports an error: the requested view will not appear."""
         self.controls.show_ready()
         self.controls.show_note(str(error) or type(error).__name__)
 
@@ -316,7 +316,7 @@ class App:
         self.canvas.add_view(step, pose, thumbnail, go_to, small=row.captured)
 
     def _go_to(self, step: int) -> None:
-        """The frustum of a view was clicked."""
+        """Selects a view whose frustum was clicked."""
         self.controls.set_step(step, len(self.story.rows))
 
     def _turn(self) -> None:

@@ -25,7 +25,7 @@ UTILITY_MAP = "viridis"
 
 
 def to_bytes(rgb: np.ndarray) -> np.ndarray:
-    """Colors [..., 3] in [0, 1] as uint8."""
+    """Converts colors [..., 3] in [0, 1] to uint8."""
     return np.rint(np.asarray(rgb, dtype=np.float64).clip(0.0, 1.0) * 255.0).astype(np.uint8)
 
 

@@ -356,7 +356,7 @@ def _number(value: float | None) -> str:
 
 @dataclass(frozen=True)
 class Caption:
-    """What is drawn."""
+    """Adds the menus that select the drawing."""
 
     layer: Layer
     moment: str

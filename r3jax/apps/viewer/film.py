@@ -135,7 +135,7 @@ class Film:
     def _draw_scene(
         self, figure: Figure, known: Known, quantity: str, azimuth: float, elevation: float
     ) -> None:
-        """Blocks, path and frusta, seen along a direction without perspective."""
+        """Draws blocks, path and frusta, seen along a direction without perspective."""
         across, outward = _view_axes(azimuth, elevation)
         axes = figure.add_axes(SCENE)
         axes.axis("off")
@@ -170,7 +170,7 @@ class Film:
             axes.add_collection(LineCollection(list(ends @ across), colors=color, linewidths=width))
 
     def _draw_column(self, figure: Figure, step: int) -> None:
-        """The photo of a view, its numbers, and mean renderability over the views so far."""
+        """Draws the photo of a view, its numbers, and mean renderability over the views so far."""
         run = self.run
         photo = style.blank(figure.add_axes((_RIGHT, 0.56, _SIDE, 0.40)))
         photo.imshow(run.images(step)[0])
@@ -201,7 +201,7 @@ def _view_axes(azimuth: float, elevation: float) -> tuple[np.ndarray, np.ndarray
 
 
 def _draw_scale(figure: Figure) -> None:
-    """The colors from 0 to 1, and that of what no place sees."""
+    """Draws the colors from 0 to 1, and that of surfaces that no place sees."""
     scale = figure.add_axes((0.016, 0.045, 0.17, 0.016))
     mapped = ScalarMappable(Normalize(0.0, 1.0), SCORES)
     bar = figure.colorbar(mapped, cax=scale, orientation="horizontal", ticks=[0.0, 0.5, 1.0])

@@ -77,7 +77,7 @@ class LiveFeed:
         self._queue.put((view, planner))
 
     def settle(self, timeout: float) -> bool:
-        """Returns when every view so far is on the page; False if that takes longer [s]."""
+        """Waits until every view so far is on the page; returns False after a timeout [s]."""
         is_empty = threading.Event()
         self._queue.put(is_empty)
         return is_empty.wait(timeout) and self.app.worker.wait(timeout)

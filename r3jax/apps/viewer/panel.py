@@ -151,7 +151,7 @@ class Controls:
         self._add_legend(gui)
 
     def _add_choices(self, gui: viser.GuiApi, menu: Menu) -> None:
-        """What is drawn."""
+        """Adds the menus that select the drawing."""
         names = tuple(self._layers)
         self._layer = gui.add_dropdown("show", names, hint=_SHOW_HINT)
         self._place = gui.add_dropdown("seen from", PLACES, hint=_SEEN_FROM_HINT)
@@ -172,7 +172,7 @@ class Controls:
             self._frusta = gui.add_checkbox("earlier views", True, hint=_FRUSTA_HINT)
 
     def _add_camera(self, gui: viser.GuiApi, menu: Menu) -> None:
-        """The camera that is dragged."""
+        """Adds the numbers and pictures of the dragged camera."""
         with gui.add_folder("Camera that you drag"):
             self._numbers = _Section(gui.add_html(pending_html()))
             self._pictures = _Section(gui.add_html(""))
@@ -183,7 +183,7 @@ class Controls:
             self._return = gui.add_button("Go to the view on the slider", hint=_RETURN_HINT)
 
     def _add_legend(self, gui: viser.GuiApi) -> None:
-        """The legend over the scene, with the sign of what is being computed."""
+        """Adds the legend over the scene, with the sign of the current computation."""
         window = gui.add_panel()
         with window.add_tab("Legend"):
             self._legend = gui.add_html("")

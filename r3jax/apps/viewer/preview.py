@@ -155,7 +155,7 @@ _INK, _PAPER = (31, 41, 55), (255, 255, 255)
 
 @functools.cache
 def _bin_of_pixel(width: int, num_bins: int) -> np.ndarray:
-    """The nearest direction of the lattice for each pixel of a panorama, [width / 2, width]."""
+    """Finds the nearest direction of the lattice per panorama pixel, [width / 2, width]."""
     height = width // 2
     elevation = 0.5 * np.pi - (np.arange(height) + 0.5) * np.pi / height
     azimuth = np.pi - (np.arange(width) + 0.5) * 2.0 * np.pi / width

@@ -219,7 +219,7 @@ class PlaceLayer:
     def _blocks(
         self, blocks: Blocks, colors: np.ndarray, cut: float, moment: str, detail: str
     ) -> _Drawing:
-        """Blocks in their colors [n, 3], cut open."""
+        """Draws blocks in their colors [n, 3], cut open."""
         low = blocks.centers[:, 2] <= cut
         show = functools.partial(
             self._canvas.show_points, "/map", blocks.centers[low], colors[low], blocks.edge
@@ -227,7 +227,7 @@ class PlaceLayer:
         return _Drawing(show, moment, detail)
 
     def _known_at(self, moment: Moment, *, with_terms: bool) -> Known:
-        """Blocks and terms of a moment, from a small cache or computed."""
+        """Returns the blocks and terms of a moment, from a small cache or computed."""
         for has_terms in (True, with_terms):
             if (moment.step, has_terms) in self._known:
                 return self._known[moment.step, has_terms]
@@ -474,7 +474,7 @@ class QueryHandler:
             yield functools.partial(self._canvas.show_grid, low, high, floor)
 
     def _show_view(self, step: int, reason: Reason | str, *, shows_views: bool) -> Show:
-        """The picture of a view, what the trace says of it, why it was taken, and its path."""
+        """Prepares the picture of a view, its facts, why it was taken, and its path."""
         rows = self._story.rows
         key = (step, len(rows), reason if isinstance(reason, str) else "")
         self._awaited = (step, reason) if isinstance(reason, str) else None

@@ -68,7 +68,7 @@ def world_glb(world: World, top: float = math.inf) -> bytes:
 
 
 def _mesh(world: World, chosen: np.ndarray, material: Material) -> trimesh.Trimesh:
-    """Returns some faces, all of one material."""
+    """Makes a mesh of some faces, all of one material."""
     corners = world.vertices[world.faces[chosen]].reshape(-1, 3)
     uv = world.face_uv[chosen].reshape(-1, 2)
     visual = TextureVisuals(uv, material=_pbr(material))

@@ -59,7 +59,7 @@ def offer_of(decision: Decision) -> Offer:
 
 
 def offer_segments(camera: Camera, offer: Offer) -> tuple[np.ndarray, np.ndarray]:
-    """Candidates as small frusta, the chosen one larger; yellow scores best, gray is out of reach.
+    """Draws candidates as frusta, the chosen one larger; yellow is best, gray is out of reach.
 
     Returns:
         Ends [s, 2, 3] float32 [m] and colors [s, 2, 3] uint8.

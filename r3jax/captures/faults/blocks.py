@@ -122,7 +122,7 @@ def _cut(image: np.ndarray, side: int) -> np.ndarray:
 
 
 def _second_differences(image: np.ndarray) -> np.ndarray:
-    """Squared second differences of an image [H, W] in `DIRECTIONS`, [H, W, 4]; 0 at the rim."""
+    """Computes squared second differences in `DIRECTIONS`, [H, W] to [H, W, 4]; 0 at the rim."""
     found = np.zeros((*image.shape, len(DIRECTIONS)), np.float32)
     middle = 2.0 * image[1:-1, 1:-1]
     found[1:-1, 1:-1, 0] = (image[1:-1, :-2] + image[1:-1, 2:] - middle) ** 2

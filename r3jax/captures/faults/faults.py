@@ -256,7 +256,7 @@ class _Names:
 
 
 def _blur(sharp: Sharpness, images: Sequence[BlockImage], names: _Names) -> list[Finding | None]:
-    """Blurred frames, by what is likely the cause."""
+    """Finds blurred frames, by their likely cause."""
     motion = image_motion(images)
     is_blurred = np.nan_to_num(sharp.share, nan=1.0) < BLURRED
     moved = is_blurred & ((sharp.lost_along < _SMEARED) | (motion > _FAST))
@@ -342,7 +342,7 @@ def _brightness(lit: Light, names: _Names) -> Finding | None:
 def _beside(
     lit: Light, values: np.ndarray, change: np.ndarray, names: _Names
 ) -> tuple[list[int], list[str]]:
-    """Frames that differ most from their neighbors, each beside one that shows the difference."""
+    """Lists the frames that differ most, each beside a neighbor that shows the difference."""
     order = [int(i) for i in np.argsort(-np.abs(np.nan_to_num(change)))]
     numbers: list[int] = []
     captions: list[str] = []

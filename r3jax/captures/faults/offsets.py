@@ -192,7 +192,7 @@ def _normals(points: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 
 def _shared(offset: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """How each of `SYSTEMATIC` moves points at offsets [b, 3] from the camera, [5, b, 3]."""
+    """Computes the move of points [b, 3] from the camera by each of `SYSTEMATIC`, [5, b, 3]."""
     local = offset @ rotation
     z = local[:, 2:]
     aside = offset - z * rotation[:, 2]

@@ -104,7 +104,7 @@ def _audit(
 
 
 def _check_folder(folder: Path, capture: Path) -> None:
-    """Only an earlier audit of the same capture is replaced."""
+    """Refuses to replace anything but an earlier audit of the same capture."""
     check_own(folder, "audit", "give another --out")
     audited = audited_capture(folder)
     if audited is not None and audited != capture.resolve():

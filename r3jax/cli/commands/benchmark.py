@@ -245,7 +245,7 @@ def _request(options: BenchmarkOptions) -> Request:
 
 
 def _run(options: BenchmarkOptions, cells: Sequence[Cell], report: Report) -> bool:
-    """Has the cells run; True if Ctrl-C ended it."""
+    """Runs the cells; returns True if Ctrl-C ended it."""
     if not cells:
         return False
     jobs = options.machines.jobs

@@ -239,7 +239,7 @@ def warn_of_versions(console: Console, run: Run) -> None:
 
 
 def _conclude(console: Console, path: Path, result: Result) -> None:
-    """Data set, report, and a few words; a full disk must not hide how the run ended."""
+    """Writes data set and report and prints a summary; a full disk must not hide the outcome."""
     settle_interrupt()  # it has ended the run; what was recorded is written out
     console.say(f"{result.reason.value}: {result.message}")
     if result.reason in EXIT_CODES:
@@ -323,7 +323,7 @@ def _crew(options: TeamOptions, console: Console, stack: contextlib.ExitStack) -
 
 
 def _conclude_team(console: Console, folder: Path, result: TeamResult) -> None:
-    """Data sets, reports, and a few words; a full disk must not hide how the team ended."""
+    """Writes data sets and reports and prints a summary; a full disk must not hide the outcome."""
     settle_interrupt()  # it has ended the runs; what was recorded is written out
     for number, member in enumerate(result.members):
         console.say(f"{number}: {member.reason.value}: {member.message}")

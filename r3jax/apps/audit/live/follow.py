@@ -259,7 +259,7 @@ def follow(
 
 
 def _step(capture: GrowingCapture, guide: Guide, page: GuidePage) -> bool:
-    """Looks once, and maps what is new; True if something was."""
+    """Looks once for new frames and maps them; returns True if there were any."""
     source, arrivals, has_moved = capture.look()
     if source is None:
         if capture.waiting_for:

@@ -58,7 +58,7 @@ def stage(path: Path, scratch: Path) -> Path:
 
 
 def _stage_recording(path: Path, scratch: Path) -> Path:
-    """Images, depth images and lines of poses.txt belong together in their order."""
+    """Links images and depth images that belong to complete lines of poses.txt, in order."""
     images = _by_stem(path / "images")
     depths = _by_stem(path / "depth")
     lines = complete_lines(path / "poses.txt")

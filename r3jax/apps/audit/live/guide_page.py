@@ -140,7 +140,7 @@ class GuidePage:
         return {"next": f"{words[:1].upper()}{words[1:]}.", "note": note, "is_current": True}
 
     def answer(self, path: str) -> tuple[str, bytes] | None:
-        """Returns kind and content of a resource; None: there is no such thing."""
+        """Returns the kind and content of a resource, or None if there is no such resource."""
         name = path.partition("?")[0].lstrip("/")
         with self._lock:
             if name == "":

@@ -169,7 +169,7 @@ def _environment(changes: dict[str, str]) -> Generator[None]:
 
 
 def _serve(pipe: Connection) -> None:
-    """A worker's life: cells in, stages and ends out."""
+    """Runs a worker: receives cells, sends stages and ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends us
     threading.Thread(target=_die_with_parent, daemon=True).start()
     while True:
@@ -199,7 +199,7 @@ def _outcome(cell: Cell, root: Path, pipe: Connection) -> tuple[str, str]:
 
 
 def _die_with_parent() -> None:
-    """A parent that is killed cannot end its workers: they notice and go."""
+    """Waits for the parent to end, and exits: a killed parent cannot end its workers."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         multiprocessing.connection.wait([parent.sentinel])

@@ -97,7 +97,7 @@ class CellJob:
     """What runs on a node."""
 
     def __call__(self, cell: Cell, root: Path) -> str:
-        """Does what is left of a cell; why it failed, or nothing."""
+        """Does what is left of a cell; returns why it failed, or nothing."""
         from r3jax.apps.benchmark.run_cell import run_cell
 
         try:
@@ -190,7 +190,7 @@ def _end_of(cell: Cell, job: Any) -> Event:
 
 
 def _end_without_result(cell: Cell, root: Path, job: Any, state: str) -> Event:
-    """Event of a job that was killed, perhaps only after its last record was written."""
+    """Makes the event of a job that was killed, perhaps only after its last record was written."""
     if not snapshots_left(root, cell):
         return Event(cell, "done")
     text = f"job {job.job_id} ended without a result: {state}"

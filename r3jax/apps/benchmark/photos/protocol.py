@@ -221,7 +221,7 @@ class _Choice:
         return eqx.tree_at(lambda s: s.sh, scene, scene.sh[:, : (degree + 1) ** 2])
 
     def _newborn(self, scene: GaussianScene) -> GaussianScene:
-        """Gaussians on what the latest photo shows and the scene has not."""
+        """Makes Gaussians on surfaces that the latest photo shows and the scene does not have."""
         latest = self.pool.views.take(np.array(self.chosen[-1:]))
         per_photo = self.terms.per_photo
         key = jax.random.key(self.seed)
