@@ -2,8 +2,13 @@
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
 
 from r3jax.errors import InputError
+
+Surfaces = Literal["auto", "depth", "sweep", "model", "points"]
+"""Where surfaces may come from: see `captures.surfaces`."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +41,15 @@ class SurveySettings:
     """Depth images hold the distance along each pixel's ray, as those of Hypersim and SceneNet do,
     and not z: convert it."""
 
+    surfaces: Surfaces = "auto"
+    """Where depth comes from: depth images (`depth`), a comparison of the photos (`sweep`), a
+    trained splat (`model`, with --model) or the sparse points alone (`points`). By default the best
+    that the capture has."""
+
+    model: Path | None = None
+    """Trained splat (.ply of gsplat, nerfstudio, INRIA's 3DGS, Brush or Postshot) in the capture's
+    coordinates: its depth is taken as the surfaces."""
+
     trust_depth: bool = False
     """Take the depth images as they are, even if they contradict the poses or each other."""
 
@@ -45,6 +59,10 @@ class SurveySettings:
             value = getattr(self, name)
             if value is not None and not 0.0 < value < math.inf:
                 raise InputError(f"--{name.replace('_', '-')} must be positive, got {value}")
+        if self.surfaces == "model" and self.model is None:
+            raise InputError("--surfaces model takes a trained splat: give --model scene.ply")
+        if self.model is not None and self.surfaces not in ("auto", "model"):
+            raise InputError(f"--model and --surfaces {self.surfaces} exclude each other")
         at_least(self, {"max_frames": 2})
 
 

@@ -14,19 +14,21 @@ Shape symbols: n images; m points; H, W image size; h, w size of a thinned image
 import dataclasses
 import functools
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from scipy import ndimage
 
-from r3jax.captures.alignment import Alignment
+from r3jax.captures.alignment import Alignment, evenly_spaced
 from r3jax.errors import InputError
 from r3jax.formats.colmap.reader import find_model
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens, pinhole_lens
 from r3jax.formats.points import read_points
-from r3jax.formats.posed_images import PosedImages
+from r3jax.formats.posed_images import PosedImages, Reconstruction
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.runs.reader import Run
@@ -35,6 +37,9 @@ from r3jax.validation.errors import ForeignFileError
 _RADIAL = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 _FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE",
             "FISHEYE")  # fmt: skip
+
+
+_DIVISION = ("SIMPLE_DIVISION", "DIVISION")
 
 
 class SamplingTable(NamedTuple):
@@ -124,6 +129,31 @@ def distorted(lens: Lens, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.
         t = angle * angle
         bent = 1.0 + t * (value("k1") + t * (value("k2") + t * (value("k3") + t * value("k4"))))
         factor = np.where(radius > 1e-9, angle * bent / np.maximum(radius, 1e-9), 1.0)
+        return x * factor, y * factor
+    if lens.model == "THIN_PRISM_FISHEYE":
+        radius = np.sqrt(squared)
+        scale = np.where(radius > 1e-9, np.arctan(radius) / np.maximum(radius, 1e-9), 1.0)
+        x, y = x * scale, y * scale
+        r2 = x * x + y * y
+        radial = r2 * (value("k1") + r2 * (value("k2") + r2 * (value("k3") + r2 * value("k4"))))
+        p1, p2 = value("p1"), value("p2")
+        return (
+            x + x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x) + value("sx1") * r2,
+            y + y * radial + 2.0 * p2 * x * y + p1 * (r2 + 2.0 * y * y) + value("sy1") * r2,
+        )
+    if lens.model == "FOV":
+        radius, omega = np.sqrt(squared), max(abs(value("omega")), 1e-6)
+        bent = np.arctan(2.0 * radius * np.tan(0.5 * omega)) / omega
+        factor = np.where(radius > 1e-9, bent / np.maximum(radius, 1e-9), 1.0)
+        return x * factor, y * factor
+    if lens.model == "EUCM":
+        alpha = value("alpha")
+        depth = alpha * np.sqrt(value("beta") * squared + 1.0) + 1.0 - alpha
+        return x / depth, y / depth
+    if lens.model in _DIVISION:
+        # r = bent / (1 + k bent^2), solved for what the lens shows.
+        under = np.maximum(1.0 - 4.0 * value("k1") * squared, 0.0)
+        factor = 2.0 / (1.0 + np.sqrt(under))
         return x * factor, y * factor
     if lens.model not in _RADIAL:
         raise ForeignFileError(
@@ -229,7 +259,13 @@ _MAX_POINTS = 500_000
 Picture = tuple[np.ndarray, np.ndarray]
 """Colors [h, w, 3] uint8 and z-depth [h, w] float32 in the capture's units; 0: unknown."""
 
-Kind = Literal["depth", "tracks", "cloud"]
+Kind = Literal["depth", "stereo", "sweep", "model", "tracks", "cloud"]
+"""Where depth comes from: a depth camera; COLMAP's stereo; our own sweep of planes; a trained
+splat; points with tracks; a cloud of points."""
+
+Photograph = tuple[np.ndarray, np.ndarray]
+"""Colors [h, w, 3] uint8 of a thinned image, and brightness in [0, 1], [h, w] float32, as means
+over its blocks; both are 0 where the lens has no pixel."""
 
 
 @dataclass(frozen=True)
@@ -249,7 +285,7 @@ class Source:
     """Names of the images."""
 
     kind: Kind
-    """Where depth comes from: depth images, tracks of points, or a cloud of points."""
+    """Where depth comes from."""
 
     is_metric: bool
     """True if a unit is a meter."""
@@ -269,6 +305,13 @@ class Source:
     remark: str | None = None
     """What the capture holds beside its images, a sentence."""
 
+    photograph: Callable[[int, int], Photograph] | None = None
+    """Reads an image of an index for a comparison with others, thinned by a stride; None: there are
+    no images."""
+
+    reconstruction: Reconstruction | None = None
+    """How well the structure from motion went; None: the format does not say."""
+
     def __len__(self) -> int:
         """Returns the number of images."""
         return len(self.poses)
@@ -276,7 +319,7 @@ class Source:
     @property
     def is_dense(self) -> bool:
         """True if depth images say where space is free."""
-        return self.kind == "depth"
+        return self.kind not in ("tracks", "cloud")
 
     @property
     def is_complete(self) -> bool:
@@ -300,7 +343,7 @@ class Source:
         Raises:
             ValueError: depth comes from points; or a scale that is not positive.
         """
-        if not self.is_dense:
+        if not self.is_complete:
             raise InputError("--depth-scale and --depth-along-ray are for depth images: here "
                              "depth comes from points")  # fmt: skip
         if not 0.0 < scale < np.inf:
@@ -381,10 +424,17 @@ def _of_images(images: PosedImages, name: str) -> Source:
             f"{images.image_paths[0]}): nothing is said of their sharpness, light or colors."
         )
         remark = none if remark is None else f"{none} {remark}"
+    if hidden := _hidden_share(images) if has_images else 0.0:
+        masked = f"Masks hide {100 * hidden:.0f} % of the pictures."
+        remark = masked if remark is None else f"{remark} {masked}"
+    photograph = (lambda index, by: _photograph(images, index, by)) if has_images else None
     if any(path is not None for path in images.depth_paths):
+        is_camera = not images.is_stereo
         return Source(
-            name, images.poses, images.lenses, labels, "depth", True, images.up, stride,
+            name, images.poses, images.lenses, labels, "depth" if is_camera else "stereo",
+            is_camera, images.up, stride,
             lambda index: _read_dense(images, index, stride, has_images), has_images, remark,
+            photograph, images.reconstruction,
         )  # fmt: skip
     if images.points is not None and len(images.points.seen_point):
         kind: Kind = "tracks"
@@ -418,7 +468,7 @@ def _of_images(images: PosedImages, name: str) -> Source:
 
     return Source(
         name, images.poses, images.lenses, labels, kind, False, images.up, stride, read, has_images,
-        remark,
+        remark, photograph, images.reconstruction,
     )  # fmt: skip
 
 
@@ -443,6 +493,38 @@ def _thinned_colors(images: PosedImages, index: int, stride: int) -> tuple[np.nd
     table = sampling_table(images.lenses[index], stride)
     rgb, mask = images.masked_rgb(index)
     return table.take(rgb), table.is_there if mask is None else table.take(mask)
+
+
+_MEASURED = 5
+"""Images whose masks are measured."""
+
+
+def _hidden_share(images: PosedImages) -> float:
+    """Measures the share of the pictures that masks and alpha channels cut out, of some."""
+    if images.pixels is not None:
+        return 0.0
+    shares: list[float] = []
+    for index in evenly_spaced(len(images), _MEASURED).tolist():
+        with suppress(FormatError):  # what cannot be read is named when all are
+            mask = images.masked_rgb(index)[1]
+            shares.append(0.0 if mask is None else float(1.0 - mask.mean()))
+    return float(np.mean(shares)) if shares else 0.0
+
+
+def _photograph(images: PosedImages, index: int, stride: int) -> Photograph:
+    table = sampling_table(images.lenses[index], stride)
+    rgb, mask = images.masked_rgb(index)
+    gray = (rgb @ _BRIGHTNESS).astype(np.float32)
+    # A pixel of the thinned image is at the middle of its block: an odd window has one, too.
+    smooth = ndimage.uniform_filter(gray, stride | 1) if stride > 1 else gray
+    colors, brightness = table.take(rgb), table.take(smooth)
+    if mask is not None:
+        brightness = np.where(table.take(mask), brightness, np.float32(0.0))
+    return colors, brightness
+
+
+_BRIGHTNESS = np.array([0.299, 0.587, 0.114], np.float32) / np.float32(255.0)
+"""Weights of red, green and blue, of 8 bits."""
 
 
 def _cloud(images: PosedImages) -> tuple[np.ndarray, np.ndarray]:

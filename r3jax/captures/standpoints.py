@@ -6,6 +6,9 @@ within the hull of the camera's positions and a margin round it, a margin from e
 where a camera was or a ray to a point passed: not inside of walls. Where the floor is known,
 somebody must be able to stand there, or to reach there with an arm.
 
+Cameras that look inward, round an object on a table or a statue, say nothing of where people stand:
+there the places are the dome of the cameras round it.
+
 Shape symbols: n cameras; m voxels; c places; p places that are chosen.
 """
 
@@ -17,6 +20,7 @@ from scipy.spatial import Delaunay, KDTree
 
 from r3jax.captures.ground import ground_of
 from r3jax.captures.survey import MARGIN
+from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.mapping.occupancy import OccupancyGrid, centers_on_host
 from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import spread
@@ -68,6 +72,7 @@ def places_of(
     *,
     is_dense: bool,
     meter: float | None,
+    center: np.ndarray | None = None,
 ) -> Places:
     """Spreads places where somebody could hold a camera.
 
@@ -78,19 +83,23 @@ def places_of(
         num: places at most.
         is_dense: True if depth images say where space is free.
         meter: a meter [audit units]; None: the capture's unit is not known.
+        center: middle of an object that the cameras look at from round it; None: they do not.
 
     Returns:
         Places in known free space; where there are few, those of the cameras, too.
     """
     voxels = np.asarray(state.center, np.float64).T[np.asarray(state.occupied)]
-    if is_dense:
+    if center is not None:
+        found = places_on_dome(cameras, center, voxels)
+    elif is_dense:
         found = places_in_free_space(grid, cameras)
     else:
         found = places_in_hull(cameras, voxels)
         found = found[is_free_at(grid, found)]
     if len(found) < _FEWEST:
         found = np.concatenate([found, cameras])
-    ground = ground_of(grid, voxels, cameras, meter) if is_dense else None
+    is_walked = is_dense and center is None
+    ground = ground_of(grid, voxels, cameras, meter) if is_walked else None
     footing = None if ground is None else ground.footing(found)
     if footing is None or footing.is_over.all():
         eyes = found[spread(found, num)]
@@ -103,6 +112,67 @@ def places_of(
         reached = reached[spread(found[reached], few)]
     rows = np.concatenate([standing, reached[:few]])
     return Places(found[rows], footing.feet[rows], len(standing), is_checked=True)
+
+
+_INWARD = 0.85
+"""Share of the cameras that must look at the middle of an object."""
+
+_ASIDE = 0.35
+"""A camera looks at the middle if its axis passes it within this share of its distance."""
+
+_AROUND = 60.0
+"""Two cameras at least look at it from directions so far apart [deg]."""
+
+_WITHIN = 0.7
+"""Half of what is seen lies within this share of the cameras' distance from the middle."""
+
+_DOME = 400
+"""Directions of the dome between which places are chosen."""
+
+
+def inward_center(poses: np.ndarray, points: np.ndarray) -> np.ndarray | None:
+    """Finds the middle of an object that cameras look at from round it, [3]; None: they do not.
+
+    Args:
+        poses: `T_world_camera`, [n, 4, 4].
+        points: surfaces, [m, 3] in the same world.
+    """
+    eye, axis = poses[:, :3, 3], poses[:, :3, 2]
+    # The point nearest to all axes: sum of (1 - a a^T) (c - eye) = 0.
+    across = np.eye(3) - axis[:, :, None] * axis[:, None, :]
+    total = across.sum(axis=0)
+    if len(poses) < 3 or np.linalg.cond(total) > 1e6:
+        return None
+    center = np.linalg.solve(total, np.einsum("nij,nj->i", across, eye))
+    offset = center - eye
+    ahead = (offset * axis).sum(axis=1)
+    aside = np.linalg.norm(offset - ahead[:, None] * axis, axis=1)
+    looks = (ahead > 0.0) & (aside <= _ASIDE * np.maximum(ahead, 1e-9))
+    distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-9)
+    toward = offset / distance[:, None]
+    is_round = float((toward @ toward.T).min()) <= np.cos(np.radians(_AROUND))
+    if looks.mean() < _INWARD or not is_round or not len(points):
+        return None
+    size = float(np.median(np.linalg.norm(points - center, axis=1)))
+    return center if size <= _WITHIN * float(np.median(distance)) else None
+
+
+def places_on_dome(cameras: np.ndarray, center: np.ndarray, voxels: np.ndarray) -> np.ndarray:
+    """Lists places round an object at the distance of its cameras, not below the lowest, [c, 3].
+
+    Args:
+        cameras: where the camera was, [n, 3] [audit units].
+        center: middle of the object, [3].
+        voxels: centers of all voxels, [m, 3], m >= 1.
+    """
+    offset = cameras - center
+    distance = np.linalg.norm(offset, axis=1)
+    lowest = float((offset[:, 2] / np.maximum(distance, 1e-9)).min())
+    directions = fibonacci_lattice(_DOME)
+    directions = directions[directions[:, 2] >= lowest - 0.05]
+    places = center + float(np.median(distance)) * directions
+    apart, _ = KDTree(voxels).query(places)
+    return places[np.asarray(apart) >= MARGIN]
 
 
 def is_free_at(grid: OccupancyGrid, places: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ Shape symbols: H, W size of the color image; h, w size of the depth image.
 """
 
 import io
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +24,7 @@ DEPTH_MODES = ("I;16", "I;16B", "I")
 """Pillow's modes of a depth image of whole numbers."""
 
 _FORMATS = ("PNG", "TIFF")
+_COLMAP = re.compile(rb"(\d{1,9})&(\d{1,9})&(\d{1,9})&")
 _NPY, _EXR = b"\x93NUMPY", b"\x76\x2f\x31\x01"
 """How these files begin."""
 
@@ -78,7 +80,9 @@ def stored_depth(data: bytes) -> np.ndarray:
         ForeignFileError: no such file, damaged, of 8 bits or with several channels; an EXR while
             OpenEXR is not installed.
     """
-    if data.startswith(_EXR):
+    if header := _COLMAP.match(data):
+        stored = _pixels_of_colmap(data, header)
+    elif data.startswith(_EXR):
         stored = _pixels_of_exr(data)
     elif data.startswith(_NPY):
         stored = read_npy(data)
@@ -94,6 +98,19 @@ def stored_depth(data: bytes) -> np.ndarray:
     is_measured = stored > 0.0  # NaN makes it false
     depth = np.where(is_measured, stored, 0.0).astype(np.float32)
     return np.where(depth < _BACKGROUND, depth, np.float32(np.inf))
+
+
+def _pixels_of_colmap(data: bytes, header: re.Match[bytes]) -> np.ndarray:
+    """Reads a depth map of COLMAP's stereo: "width&height&1&", then floats row by row."""
+    width, height, channels = (int(number) for number in header.groups())
+    if channels != 1 or not 0 < width * height <= MAX_PIXELS:
+        raise ForeignFileError(f"the depth map is {width} x {height} x {channels}")
+    left = len(data) - header.end()
+    if left != 4 * width * height:
+        raise ForeignFileError(
+            f"it promises {width} x {height} pixels, but {left} bytes follow: is it cut off?"
+        )
+    return np.frombuffer(data, "<f4", width * height, header.end()).reshape(height, width)
 
 
 def check_exr() -> None:

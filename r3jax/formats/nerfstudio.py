@@ -108,6 +108,7 @@ def read_transforms(path: Path | str) -> PosedImages:
         points_path = None if points is None else below(path.parent, points)
         moved, unit = _applied(content), _depth_unit(content)
         depths = [_depth(path.parent, i, frame) for i, frame in enumerate(frames)]
+        masks = [_mask(path.parent, i, frame) for i, frame in enumerate(frames)]
         scale = _applied_scale(content)
     lenses = [
         _lens(path, f"frames[{i}]", {**content, **frame}, [image, *images])
@@ -142,7 +143,16 @@ def read_transforms(path: Path | str) -> PosedImages:
         points_path=points_path,
         T_capture_original=moved,
         remark=remark,
+        mask_paths=tuple(masks) if any(masks) else None,
     )
+
+
+def _mask(folder: Path, index: int, frame: dict[str, Any]) -> Path | None:
+    """Returns the mask of a frame, if one is named and there."""
+    name = frame.get("mask_path")
+    check_type(f"frames[{index}].mask_path", name, str | None)
+    found = None if name is None else below(folder, name)
+    return found if found is not None and found.is_file() else None
 
 
 def _smaller_copies(folder: Path, images: list[Path]) -> list[Path]:

@@ -27,7 +27,7 @@ from r3jax.formats.lenses import Lens
 from r3jax.frame import Frame
 from r3jax.validation.errors import ForeignFileError
 from r3jax.validation.files import read_bytes
-from r3jax.validation.images import first_size, image_size, masked_pixels
+from r3jax.validation.images import first_size, image_pixels, image_size, masked_pixels
 
 IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP")
 """What Pillow may try."""
@@ -35,8 +35,34 @@ IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP")
 _MEASURED = 5
 """Images of a lens whose size is compared with it: one may be another's namesake."""
 
+_WHITE = 128
+"""Pixels of a mask that are darker do not count."""
+
 _MAX_DEPTH = 256 << 20
 """Floats of the largest image, and a header [bytes]."""
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """How well a structure from motion went; None where the model does not say."""
+
+    posed: int
+    """Pictures with a pose in this model."""
+
+    pictures: int
+    """Pictures beside them, with or without a pose."""
+
+    error_median: float | None
+    """Median over the points of their mean reprojection error [px]."""
+
+    error_p95: float | None
+    """95th percentile of the same [px]."""
+
+    track_length: float | None
+    """Mean number of pictures that see a point."""
+
+    angle: float | None
+    """Median over the points of the widest angle between two of their rays [deg]."""
 
 
 @dataclass(frozen=True)
@@ -120,6 +146,17 @@ class PosedImages:
     remark: str | None = None
     """What else is there but not among the images, a sentence; None: nothing is left out."""
 
+    mask_paths: tuple[Path | None, ...] | None = None
+    """One per image: black pixels of these images do not count (people, the sky, a turntable);
+    None: there are no masks."""
+
+    is_stereo: bool = False
+    """True if depth was computed from the images, not measured: its holes are not known, and its
+    unit is the poses'."""
+
+    reconstruction: Reconstruction | None = None
+    """How well the structure from motion went; None: the format does not say."""
+
     def __len__(self) -> int:
         """Returns the number of images."""
         return len(self.image_paths)
@@ -199,7 +236,7 @@ class PosedImages:
         return self.masked_rgb(index)[0]
 
     def masked_rgb(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """Reads the pixels of one image, and which of them its alpha channel keeps.
+        """Reads the pixels of one image, and which of them alpha and mask do not cut out.
 
         Returns:
             [H, W, 3] uint8 as `rgb`, and [H, W] bool; None: all of them count.
@@ -211,7 +248,14 @@ class PosedImages:
             return self.pixels.rgb(index), None
         path, lens = self.image_paths[index], self.lenses[index]
         with naming(path):
-            return masked_pixels(path, IMAGE_FORMATS, (lens.width, lens.height))
+            rgb, is_there = masked_pixels(path, IMAGE_FORMATS, (lens.width, lens.height))
+        mask_path = None if self.mask_paths is None else self.mask_paths[index]
+        if mask_path is None:
+            return rgb, is_there
+        with naming(mask_path):
+            mask = image_pixels(mask_path, IMAGE_FORMATS).max(axis=2) >= _WHITE
+        mask = resample_depth(mask, lens)
+        return rgb, mask if is_there is None else mask & is_there
 
     def depth(self, index: int) -> np.ndarray | None:
         """Reads the depth of one image, pixel by pixel as in `rgb`, [H, W] float32; None without.
@@ -272,6 +316,19 @@ def find_images(places: Iterable[Path], names: Mapping[str, Lens]) -> Path | Non
         if there and (found := (_fits(folder, there, names), len(there))) > most:
             best, most = folder, found
     return best
+
+
+def find_mask(folder: Path, name: str) -> Path | None:
+    """Finds the mask of an image: `masks/NAME.png`, as COLMAP has them, or of the same stem.
+
+    Args:
+        folder: that holds the folder of the masks.
+        name: of the image, below the folder of the images.
+    """
+    masks = folder / "masks"
+    places = (masks / f"{name}.png", masks / Path(name).with_suffix(".png"))
+    # os.path: a name of a foreign file may be longer than a file's can be.
+    return next((place for place in places if os.path.isfile(place)), None)
 
 
 def _fits(folder: Path, there: list[str], names: Mapping[str, Lens]) -> bool:

@@ -19,4 +19,6 @@ compiled. Each is held to its formula by a test.
 | `adam` | `splatting.training.optimizer.adam_update` | `splatting/training/test_kernels.py` |
 | `squares` | `baselines.information.pixel_squares` | `baselines/test_information.py` |
 | `tallies` | `baselines.information.pixel_tallies` | `baselines/test_information.py` |
+| `sweep.plane_scores` | `captures.sweep.plane_scores` | `captures/test_sweep.py` |
+| `sweep.smooth_scores` | `captures.sweep.smooth_scores` | `captures/test_sweep.py` |
 """

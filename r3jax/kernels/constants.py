@@ -122,3 +122,9 @@ MISSES_OF_FEW = 2
 
 MISSES = 3
 """The same for a voxel of more observations."""
+
+LEAST_DEVIATION = 0.008
+"""Windows whose brightness deviates by less (two of 255 steps) have no texture to compare."""
+
+NO_SCORE = -1.0
+"""Score of a comparison that cannot be made."""

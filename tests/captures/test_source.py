@@ -41,6 +41,24 @@ SOME = {
     "OPENCV_FISHEYE": (400.0, 410.0, 320.0, 240.0, 0.05, -0.01, 0.003, 0.001),
     "SIMPLE_RADIAL_FISHEYE": (400.0, 320.0, 240.0, 0.05),
     "RADIAL_FISHEYE": (400.0, 320.0, 240.0, 0.05, -0.01),
+    "THIN_PRISM_FISHEYE": (
+        400.0,
+        410.0,
+        320.0,
+        240.0,
+        0.05,
+        -0.01,
+        0.002,
+        -0.001,
+        0.003,
+        0.001,
+        0.004,
+        -0.002,
+    ),
+    "FOV": (400.0, 410.0, 320.0, 240.0, 0.9),
+    "EUCM": (400.0, 410.0, 320.0, 240.0, 0.6, 1.1),
+    "SIMPLE_DIVISION": (400.0, 320.0, 240.0, -0.2),
+    "DIVISION": (400.0, 410.0, 320.0, 240.0, -0.1),
 }
 
 
@@ -88,9 +106,11 @@ def test_nothing_is_invented_where_the_lens_saw_nothing():
 
 
 def test_a_lens_nobody_straightens_here_is_named():
-    params = (40.0, 40.0, 32.0, 24.0, *[0.1] * (len(MODELS["THIN_PRISM_FISHEYE"][1]) - 4))
-    with pytest.raises(ForeignFileError, match="THIN_PRISM_FISHEYE lens are not straightened"):
-        sampling_table(Lens("THIN_PRISM_FISHEYE", 64, 48, params), 2)
+    params = (40.0, 40.0, 32.0, 24.0, *[0.1] * (len(MODELS["RAD_TAN_THIN_PRISM_FISHEYE"][1]) - 4))
+    with pytest.raises(
+        ForeignFileError, match="RAD_TAN_THIN_PRISM_FISHEYE lens are not straightened"
+    ):
+        sampling_table(Lens("RAD_TAN_THIN_PRISM_FISHEYE", 64, 48, params), 2)
 
 
 CAMERA = Camera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)

@@ -6,9 +6,15 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r3jax.captures.standpoints import places_in_free_space, places_in_hull
+from r3jax.captures.standpoints import (
+    inward_center,
+    places_in_free_space,
+    places_in_hull,
+    places_on_dome,
+)
 from r3jax.captures.survey import MARGIN
 from r3jax.mapping.occupancy import LOG_ODDS_LIMIT, OccupancyGrid, empty_grid
+from tests.apps.audit.room import pose_at
 
 
 def grid_of(free: np.ndarray) -> OccupancyGrid:
@@ -69,3 +75,27 @@ def test_one_camera_alone_leaves_the_box_round_it():
     places = places_in_hull(np.array([[1.0, 2.0, 3.0]]), np.array([[9.0, 9.0, 9.0]]))
     assert len(places) > 4
     assert np.abs(places - [1, 2, 3]).max() <= MARGIN
+
+
+@given(
+    middle=st.tuples(*[st.floats(-3, 3)] * 3), height=st.floats(0.2, 1.5), seed=st.integers(0, 99)
+)
+def test_cameras_round_an_object_are_told_from_cameras_in_a_room(middle, height, seed):
+    rng = np.random.default_rng(seed)
+    middle = np.array(middle)
+    angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    ring = np.stack([2 * np.cos(angles), 2 * np.sin(angles), np.full(12, height)], axis=1)
+    target = middle + 0.1 * rng.normal(size=(12, 3))
+    round_it = np.stack([pose_at(middle + r, t) for r, t in zip(ring, target, strict=True)])
+    surface = middle + 0.3 * rng.normal(size=(60, 3))
+    found = inward_center(round_it, surface)
+    assert found is not None
+    assert np.linalg.norm(found - middle) < 0.3
+    places = places_on_dome(round_it[:, :3, 3], found, surface)
+    assert len(places) > 50
+    off = np.linalg.norm(places - found, axis=1) / np.linalg.norm(ring[0])
+    assert (np.abs(off - 1.0) < 0.2).all()
+    outward = np.stack([pose_at(middle + r, middle + 2 * r) for r in ring])
+    assert inward_center(outward, middle + 5 * ring) is None
+    # Walls all round, seen across the room, are no object.
+    assert inward_center(round_it, middle + 2.5 * rng.normal(size=(60, 3))) is None

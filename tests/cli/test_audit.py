@@ -131,7 +131,7 @@ def test_recordings_of_robots_are_audited(tmp_path, kind, capsys):
     ["nerfstudio", pytest.param("nerfstudio/transforms.json", marks=pytest.mark.slow), "colmap"],
 )
 def test_other_formats_are_audited(captures, tmp_path, name, capsys):
-    words = [] if name == "colmap" else ["--voxel-size", "0.15"]
+    words = ["--surfaces", "points"] if name == "colmap" else ["--voxel-size", "0.15"]
     assert audit(captures / name, tmp_path / "out", *words) == 0
     said = " ".join(capsys.readouterr().out.split())  # lines are wrapped
     assert "is seen well enough (R ≥ 0.5)" in said

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import given
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from r3jax.formats.colmap.binary import read_binary, write_binary
@@ -95,7 +96,10 @@ def test_cameras_names_and_tracks_of_a_file_written_by_hand(capture):
     assert len(points.seen_image) == 3
 
 
-@pytest.mark.parametrize("place", [".", "sparse", "colmap/sparse/0"])
+@pytest.mark.parametrize(
+    "place",
+    [".", "sparse", "colmap/sparse/0", "distorted/sparse/0", "sparse/3", "dense/0/sparse"],
+)
 def test_the_model_is_found_where_tools_put_it(tmp_path, place):
     (tmp_path / place).mkdir(parents=True, exist_ok=True)
     write_binary(tmp_path / place, random_model(3))
@@ -129,11 +133,11 @@ def test_of_several_models_the_one_with_most_images_is_taken(split):
     assert list(counts.values()).count(counts[best]) == 1
     images = read_colmap(folder)
     assert len(images) == counts[best]
-    others = ", ".join(str(counts[name]) for name in counts if name != best)
-    assert images.remark == (
-        f"COLMAP did not join all: of its 3 models sparse/{best} is used, with {counts[best]} "
-        f"pictures; the other ones have {others}."
-    )
+    assert images.remark is not None
+    assert f"sparse/{best} is used, with {counts[best]} pictures" in images.remark
+    for name in counts:
+        if name != best:
+            assert f"sparse/{name} has {counts[name]} " in images.remark
     asked_for = read_colmap(folder / "sparse" / "0")
     assert len(asked_for) == counts["0"]
     assert asked_for.remark is None
@@ -144,7 +148,17 @@ def test_pictures_without_a_pose_are_counted(capture):
     assert read_colmap(capture).remark is None
     for name in ("second image.png", "third.png", "notes.txt"):
         (capture / "images" / name).touch()
-    assert read_colmap(capture).remark == "2 of 3 pictures have a pose."
+    remark = read_colmap(capture).remark
+    assert remark is not None
+    assert remark.startswith("2 of 3 pictures have a pose")
+    assert "third.png" in remark
+    for i in range(4):
+        (capture / "images" / f"further{i}.png").touch()
+    found = read_colmap(capture)
+    assert found.remark is not None
+    assert found.remark.startswith("The reconstruction failed for most pictures: only 2 of 7")
+    assert found.reconstruction is not None
+    assert (found.reconstruction.posed, found.reconstruction.pictures) == (2, 7)
 
 
 def test_binary_goes_before_text(capture):
@@ -192,3 +206,79 @@ def test_no_model_is_said(tmp_path):
         read_colmap(tmp_path)
     with pytest.raises(FormatError, match="no such folder"):
         read_colmap(tmp_path / "nowhere")
+
+
+def depth_map(depth: np.ndarray) -> bytes:
+    """As COLMAP's stereo writes it."""
+    height, width = depth.shape
+    return f"{width}&{height}&1&".encode() + depth.astype("<f4").tobytes()
+
+
+@pytest.fixture
+def dense(capture):
+    """An undistorted capture with stereo, beside the model that it was made of."""
+    folder = capture / "dense" / "0"
+    (folder / "images" / "a").mkdir(parents=True)
+    (folder / "stereo" / "depth_maps" / "a").mkdir(parents=True)
+    (folder / "sparse").mkdir()
+    undistorted = CAMERAS.replace(
+        "SIMPLE_RADIAL 640 480 500.5 320 240 -0.01", "PINHOLE 20 10 15 16 10 5"
+    )
+    for name, text in {**CAPTURE, "cameras.txt": undistorted}.items():
+        (folder / "sparse" / name).write_text(text)
+    for name in ("rigs.bin", "frames.bin"):
+        (folder / "sparse" / name).write_bytes(b"what they say is in images.bin, too")
+    Image.new("RGB", (20, 10)).save(folder / "images" / "a" / "first.png")
+    Image.new("RGB", (20, 10)).save(folder / "images" / "second image.png")
+    return capture
+
+
+def test_depth_of_colmaps_stereo_is_read_where_it_lies(dense):
+    depths = dense / "dense" / "0" / "stereo" / "depth_maps"
+    ramp = np.arange(200.0).reshape(10, 20)
+    (depths / "a" / "first.png.photometric.bin").write_bytes(depth_map(ramp + 7.0))
+    assert read_colmap(dense).is_stereo
+    np.testing.assert_array_equal(read_colmap(dense).depth(0), ramp + 7.0)
+    (depths / "a" / "first.png.geometric.bin").write_bytes(depth_map(ramp))
+    images = read_colmap(dense)
+    np.testing.assert_array_equal(images.depth(0), ramp)  # checked between images: goes first
+    assert images.depth(1) is None
+    assert all(path.is_file() for path in images.image_paths)
+    assert all(lens.is_pinhole for lens in images.lenses)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        depth_map(np.ones((10, 20)))[:-1],
+        depth_map(np.ones((10, 20))) + b"\0",
+        b"99999999&99999999&1&",
+        b"20&10&3&" + bytes(2400),
+    ],
+)
+def test_a_damaged_depth_map_of_colmap_is_refused(dense, data):
+    path = dense / "dense" / "0" / "stereo" / "depth_maps" / "a" / "first.png.geometric.bin"
+    path.write_bytes(data)
+    with pytest.raises(FormatError, match="geometric"):
+        read_colmap(dense).depth(0)
+
+
+def test_a_lens_that_none_has_is_said(capture):
+    cameras = CAMERAS.replace("PINHOLE 20 10 15 16", "PINHOLE 540 360 315 753")
+    (capture / "sparse" / "0" / "cameras.txt").write_text(cameras)
+    remark = read_colmap(capture).remark
+    assert remark is not None
+    assert "315 and 753 px" in remark
+
+
+def test_masks_beside_the_images_are_honored(capture):
+    (capture / "images" / "a").mkdir(parents=True)
+    (capture / "masks" / "a").mkdir(parents=True)
+    Image.new("RGB", (20, 10), (9, 8, 7)).save(capture / "images" / "a" / "first.png")
+    mask = np.zeros((5, 10), np.uint8)
+    mask[:, 4:] = 255
+    Image.fromarray(mask).save(capture / "masks" / "a" / "first.png.png")  # as COLMAP names it
+    rgb, is_there = read_colmap(capture).masked_rgb(0)
+    assert rgb.shape == (10, 20, 3)
+    assert is_there is not None
+    np.testing.assert_array_equal(is_there, np.arange(20)[None].repeat(10, axis=0) >= 8)

@@ -7,6 +7,7 @@ import pytest
 
 from r3jax.formats.colmap.binary import read_binary, write_binary
 from r3jax.formats.colmap.model import ColmapModel, points_without_tracks, pose_of
+from r3jax.formats.colmap.quality import reconstruction_of
 from r3jax.formats.colmap.reader import read_colmap, read_model
 from r3jax.formats.colmap.text import read_text, write_text
 from r3jax.formats.exports import posed_model
@@ -151,3 +152,22 @@ def test_every_camera_model_has_colmaps_number_and_parameters(model):
     )
     principal = camera.principal_point_x, camera.principal_point_y
     assert principal == lens.intrinsics[2:]
+
+
+def test_the_numbers_of_a_reconstruction_are_colmaps(shared):
+    folder = shared("recordings", "lounge_sfm", "sparse", "3")
+    ours = reconstruction_of(read_model(folder), unposed=27)
+    theirs = pycolmap.Reconstruction(folder)
+    assert (ours.posed, ours.pictures) == (theirs.num_reg_images(), theirs.num_reg_images() + 27)
+    assert ours.track_length == pytest.approx(theirs.compute_mean_track_length())
+    errors = [point.error for point in theirs.points3D.values()]
+    assert ours.error_median == pytest.approx(np.median(errors))
+    assert ours.error_p95 == pytest.approx(np.percentile(errors, 95))
+    angles = []
+    for point in theirs.points3D.values():
+        centers = [theirs.images[e.image_id].projection_center() for e in point.track.elements]
+        rays = [point.xyz - center for center in centers]
+        rays = [ray / np.linalg.norm(ray) for ray in rays]
+        cosines = [a @ b for i, a in enumerate(rays) for b in rays[:i]]
+        angles.append(np.degrees(np.arccos(np.clip(min(cosines), -1, 1))))
+    assert ours.angle == pytest.approx(np.median(angles))

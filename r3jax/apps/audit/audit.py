@@ -34,7 +34,8 @@ from r3jax.captures.camera_paths import CameraPath
 from r3jax.captures.capture_maps import Seen, see
 from r3jax.captures.faults.faults import Faults, find_faults, stray_finding
 from r3jax.captures.source import Source, thinned
-from r3jax.captures.standpoints import Places, places_of
+from r3jax.captures.standpoints import Places, inward_center, places_of
+from r3jax.captures.surfaces import with_surfaces
 from r3jax.captures.survey import RANGE, Survey, survey_of
 from r3jax.errors import InputError
 from r3jax.formats.lenses import Lens
@@ -91,6 +92,9 @@ class Audit:
 
     standpoints: np.ndarray
     """From where surfaces were evaluated, the first places to stand, [q, 3] [audit units]."""
+
+    is_object: bool
+    """True if the cameras look inward: the places are the dome of cameras round an object."""
 
     frames: tuple[EvaluatedFrame, ...]
     """The path."""
@@ -196,6 +200,7 @@ def audit(
     settings = AuditSettings() if settings is None else settings
     if settings.depth_scale != 1.0 or settings.depth_along_ray:
         source = source.with_depth(settings.depth_scale, is_along_ray=settings.depth_along_ray)
+    source = with_surfaces(source, settings.surfaces, settings.model, on_progress)
     step = lambda: on_progress("", 1)
     on_progress("looking at the capture", 0)
     survey = survey_of(source, settings)
@@ -218,6 +223,8 @@ def audit(
     lens = Counter(source.lenses).most_common(1)[0][0]
     camera = thinned(lens.camera, source.stride)
     cameras = survey.alignment.points(source.poses[survey.chosen, :3, 3])
+    surfaces = np.asarray(seen.state.center, np.float64).T[np.asarray(seen.state.present)]
+    center = inward_center(survey.alignment.poses(source.poses[survey.chosen]), surfaces)
     places = places_of(
         seen.state,
         seen.grid,
@@ -225,6 +232,7 @@ def audit(
         settings.num_places,
         is_dense=source.is_dense,
         meter=survey.alignment.scale if source.is_metric else None,
+        center=center,
     )
     standpoints = places.standing[: settings.num_standpoints]
     on_progress("evaluating frames", 0)
@@ -253,6 +261,7 @@ def audit(
         lens=lens,
         places=places,
         standpoints=standpoints,
+        is_object=center is not None,
         frames=frames,
         is_own_path=path is None,
         regions=tuple(bad_regions(seen.state, plan.before)),
@@ -320,7 +329,7 @@ def _open_grid(
     An edge is where free space ends although it could have been seen.
     """
     grid = seen.grid
-    if not source.is_dense:
+    if not source.is_complete:  # what borders on free space may have been in view, and is not known
         return grid.ignoring(grid.unexplored)
     cells = np.floor((cameras - np.asarray(grid.origin)) / float(grid.cell_size)).astype(np.int64)
     cells = cells.clip(0, np.array(grid.log_odds.shape) - 1)

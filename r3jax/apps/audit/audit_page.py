@@ -78,6 +78,7 @@ def write_report(audit: Audit, folder: Path, files: Iterable[Path] = ()) -> Path
         plan=to_png(plan_figure(audit)),
         values=to_png(value_figure(audit)),
         causes=_causes(audit),
+        reconstruction=_reconstruction(audit),
         block=sentences.length(audit, 1.0),
         region_pictures=None if region_figure is None else to_png(region_figure),
         regions=_regions(audit),
@@ -186,6 +187,25 @@ def _thumbnail(audit: Audit, index: int) -> bytes:
     rgb, _ = audit.source.read(index)
     up = audit.survey.alignment.rotation.T @ [0.0, 0.0, 1.0]
     return small_png(rgb, audit.source.poses[index], up, _SIDE)
+
+
+def _reconstruction(audit: Audit) -> list[dict[str, str]]:
+    """Lists the field's own numbers of a structure from motion, and what is usual."""
+    found = audit.source.reconstruction
+    if found is None:
+        return []
+    numbers = (
+        ("pictures with a pose", f"{found.posed} of {found.pictures}", "95 % or more"),
+        ("reprojection error, median", _number(found.error_median, " px"), "0.4 to 1 px"),
+        ("reprojection error, 95th percentile", _number(found.error_p95, " px"), "below 2 px"),
+        ("pictures that see a point, mean", _number(found.track_length, ""), "4 or more"),
+        ("angle between a point's rays, median", _number(found.angle, "°"), "5 to 30°"),
+    )
+    return [{"name": name, "value": value, "usual": usual} for name, value, usual in numbers]
+
+
+def _number(value: float | None, unit: str) -> str:
+    return "not known" if value is None else f"{value:.2g}{unit}"
 
 
 def _causes(audit: Audit) -> list[dict[str, Any]]:

@@ -19,6 +19,7 @@ from r3jax.apps.audit.bad_regions import Region
 from r3jax.apps.audit.diagnosis import CAUSES, FEW, FINE, NOT_KNOWN, ViewScore
 from r3jax.apps.audit.ground_plan import cause_colors, score_colors
 from r3jax.captures.camera_paths import write_camera_path, write_path_transforms
+from r3jax.captures.source import Source
 from r3jax.files import write_atomic
 from r3jax.formats.nerfstudio import OPENGL_FROM_OPENCV
 from r3jax.formats.points import write_points
@@ -121,6 +122,7 @@ def record_of(audit: Audit) -> dict[str, Any]:
         "capture": audit.source.name,
         "unit": "metre" if audit.source.is_metric else "unknown",
         "depth_from": audit.source.kind,
+        "reconstruction": _reconstruction(audit.source),
         "pictures": len(audit.source),
         "pictures_used": survey.chosen.tolist(),
         "pictures_diverged": list(survey.strays),
@@ -136,6 +138,7 @@ def record_of(audit: Audit) -> dict[str, Any]:
         "up": survey.up.direction.tolist(),
         "up_is_within_degrees": survey.up.within,
         "taken_from_one_place": survey.is_one_place,
+        "looks_inward": audit.is_object,
         "folds": len(audit.seen.folds),
         "fine_from": FINE,
         "rare_below": FEW,
@@ -207,6 +210,11 @@ def _score(score: ViewScore) -> dict[str, Any]:
     """Returns the scores of a frame; the renderability is null if it shows no known surface."""
     known = None if np.isnan(score.renderability) else score.renderability
     return {**dataclasses.asdict(score), "renderability": known}
+
+
+def _reconstruction(source: Source) -> dict[str, Any] | None:
+    found = source.reconstruction
+    return None if found is None else dataclasses.asdict(found)
 
 
 def _region(audit: Audit, region: Region) -> dict[str, Any]:

@@ -57,6 +57,16 @@ _SEVERE = ("pose", "scale", "ray", "camera", "stray")
 _LEAST_TOLD, _THINGS = 0.03, 3
 """Share from which on a cause is among the things to do; and how many of these there are."""
 
+_DEPTH_FROM = {
+    "depth": "depth images",
+    "stereo": "COLMAP's stereo, computed from the photos",
+    "sweep": "a comparison of the photos with each other (plane sweep)",
+    "model": "the trained splat",
+    "tracks": "the points whose tracks name the picture",
+    "cloud": "the cloud's points that no nearer one hides",
+}
+"""Source of the surfaces."""
+
 _MOST_SAID = 4
 """Findings on single pictures that the summary repeats."""
 
@@ -123,6 +133,11 @@ def verdict(audit: Audit) -> list[str]:
         sentences.append(f"The pictures themselves: {said}")
     if not audit.faults.fits:
         sentences.append(CONTRADICTED)
+    if audit.is_object:
+        sentences.append(
+            "The cameras look inward at an object: it is judged from the dome of the cameras round "
+            "it, not from where people could stand."
+        )
     if audit.unseen:
         sentences.append(
             f"About {area(audit, audit.unseen_area)} bordering free space was never photographed."
@@ -150,7 +165,11 @@ def _surfaces(audit: Audit) -> str:
     if audit.source.is_complete:
         start = f"{fine} of the surface that a person sees from where one can stand"
     else:
-        start = f"{fine} of what the {'pictures' if audit.is_own_path else 'frames'} show"
+        what = "pictures" if audit.is_own_path else "frames"
+        start = (
+            f"Without a depth camera, surfaces are known from {_DEPTH_FROM[audit.source.kind]}. "
+            f"{fine} of what the {what} show"
+        )
         parts.append(f"{_unknown(audit)} is not known ({MEANING[NOT_KNOWN]})")
     well = f"R ≥ {FINE:g}" + ("" if audit.source.has_images else ", if colors agree")
     return f"{start} is seen well enough ({well})" + (f"; {listed(parts)}." if parts else ".")
@@ -281,11 +300,7 @@ def reason(audit: Audit, view: Suggestion, letters: Iterable[str]) -> str:
 def method(audit: Audit) -> list[str]:
     """Explains how the numbers were computed, in a sentence or two each."""
     survey, source = audit.survey, audit.source
-    depth = {
-        "depth": "depth images",
-        "tracks": "the points whose tracks name the picture",
-        "cloud": "the cloud's points that no nearer one hides",
-    }[source.kind]
+    depth = _DEPTH_FROM[source.kind]
     sentences = [
         f"{len(survey.chosen)} of {len(source)} pictures, every {_ordinal(source.stride)} pixel "
         f"along rows and columns; depth from {depth}.",
@@ -329,6 +344,11 @@ def method(audit: Audit) -> list[str]:
         else f"within the hull of the camera's positions and {length(audit, 0.3)} round it, "
         f"{length(audit, 0.3)} from every voxel, where a camera was or a ray to a point passed"
     )
+    if audit.is_object:
+        where = (
+            "on the dome of the cameras round the object that they look at, not below the lowest "
+            f"of them and {length(audit, 0.3)} from every voxel"
+        )
     sentences.append(
         f"Views: of {len(audit.places.eyes)} places {where}, {DIRECTIONS} directions each, those "
         f"of which {100 * OVERLAP:.0f} % or more show what is known (or a picture could not be "

@@ -1,28 +1,47 @@
 """A folder with a COLMAP model as posed images."""
 
+import itertools
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from r3jax.formats.colmap.binary import read_binary
 from r3jax.formats.colmap.model import ColmapImage, ColmapModel, ColmapPoints, pose_of
+from r3jax.formats.colmap.quality import reconstruction_of
 from r3jax.formats.colmap.text import read_text
 from r3jax.formats.errors import FormatError
 from r3jax.formats.lenses import Lens
-from r3jax.formats.posed_images import PosedImages, SparsePoints, find_images
+from r3jax.formats.posed_images import PosedImages, SparsePoints, find_images, find_mask
 from r3jax.validation.errors import ForeignFileError
 from r3jax.validation.files import below, check_relative
 
 _MODEL_FOLDERS = (
     *(".", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap"),
-    *("colmap_sparse/0", "colmap_text"),
+    *("colmap_sparse/0", "colmap_text", "distorted/sparse/0", "distorted/sparse"),
+    *("dense/sparse", "dense/0/sparse"),
 )
-"""Where COLMAP, its users, nerfstudio and instant-ngp put the model of a capture."""
+"""Where COLMAP, its users, nerfstudio, instant-ngp and INRIA's converter put the model of a
+capture."""
+
+_NUMBERED = ("sparse", "colmap/sparse", "distorted/sparse")
+"""Where models are numbered; the first of them may be missing."""
+
+_DENSE = (".", "dense", "dense/0")
+"""Where COLMAP's undistorter puts images, their model and the depth of its stereo."""
+
+_STEREO = ("geometric", "photometric")
+"""Depth that was checked between images goes first."""
 
 _MAX_EXTRA = 1.0
 _FOCAL_RATIOS = (0.1, 10.0)
+_SQUARE = 1.25
+"""Pixels are square: no lens has focal lengths along x and y that differ by more than this."""
+_FAILED = 0.5
+"""Of a reconstruction with poses for fewer of the pictures that is said first."""
+_MOST_NAMED = 5
+"""Pictures without a model that are named."""
 _SERIES = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")
 """COLMAP's mapper calls a lens bogus whose distortion, or whose focal length by its longer side,
 lies beyond; a model can still end with one when the last adjustment moves it. Terms of fisheyes
@@ -33,7 +52,28 @@ def find_model(path: Path) -> Path | None:
     """Finds the folder of the model in a capture's folder; None if there is none."""
     for name in _MODEL_FOLDERS:
         folder = path / name
-        if any((folder / f"cameras{suffix}").exists() for suffix in (".bin", ".txt")):
+        if _holds_model(folder):
+            return folder
+    for name in _NUMBERED:
+        if os.path.isdir(path / name):
+            found = _numbered(path / name / "0")
+            if found:
+                return found[0]
+    return None
+
+
+def _holds_model(folder: Path) -> bool:
+    return any((folder / f"cameras{suffix}").exists() for suffix in (".bin", ".txt"))
+
+
+def find_stereo(path: Path) -> Path | None:
+    """Finds an undistorted capture with depth of COLMAP's stereo in a folder; None: none."""
+    for folder in (path / name for name in _DENSE):
+        depths = folder / "stereo" / "depth_maps"
+        endings = tuple(f".{kind}.bin" for kind in _STEREO)
+        if _holds_model(folder / "sparse") and any(
+            depth.name.endswith(endings) for depth in depths.rglob("*.bin")
+        ):
             return folder
     return None
 
@@ -64,7 +104,9 @@ def read_colmap(path: Path | str, images: Path | str | None = None) -> PosedImag
 
     Args:
         path: the folder of the model, or the capture's, with the model in `sparse/0` or the like;
-            if there are several, `sparse/1` and so on, the one with most images is taken.
+            if there are several, `sparse/1` and so on, the one with most images is taken. Where
+            COLMAP's stereo has left depth (`dense/stereo/depth_maps`), its undistorted images with
+            that depth.
         images: the folder that the images' names are relative to; by default the one of the usual
             names, beside the model or in one of the three folders above it, that holds most.
 
@@ -73,22 +115,30 @@ def read_colmap(path: Path | str, images: Path | str | None = None) -> PosedImag
             noticed when they are read.
     """
     path = Path(path)
+    dense = find_stereo(path)
     folder, models = _models(path)
     model = models[folder]
     ordered = sorted(model.images, key=lambda image: image.name)
     lenses = tuple(model.cameras[image.camera_id] for image in ordered)
     here = folder.resolve()
     names = dict(zip((image.name for image in ordered), lenses, strict=True))
-    found = images or find_images([path, here, *here.parents[:3]], names) or path / "images"
+    places = [path, here, *here.parents[:3]] if dense is None else [dense, path]
+    found = images or find_images(places, names) or path / "images"
     image_paths = tuple(below(Path(found), image.name) for image in ordered)
+    depths = [_stereo_depth(dense, image.name) for image in ordered]
+    masks = [find_mask(Path(found).parent, image.name) for image in ordered]
+    unposed = _unposed(set(image_paths))
     return PosedImages(
         path=path,
         image_paths=image_paths,
         lenses=lenses,
         poses=np.stack([pose_of(image.quaternion, image.translation) for image in ordered]),
-        depth_paths=(None,) * len(ordered),
+        depth_paths=tuple(depths),
         points=_sparse_points(model.points, {image.id: i for i, image in enumerate(ordered)}),
-        remark=_left_out(folder, models, image_paths),
+        remark=_left_out(folder, models, unposed),
+        mask_paths=tuple(masks) if any(masks) else None,
+        is_stereo=any(depth is not None for depth in depths),
+        reconstruction=reconstruction_of(model, len(unposed)),
     )
 
 
@@ -106,16 +156,33 @@ def main_model(path: Path) -> tuple[Path, ColmapModel] | None:
 
 def _models(path: Path) -> tuple[Path, dict[Path, ColmapModel]]:
     """Returns all models of a capture, and the folder of the one with most images."""
-    folder = find_model(path)
+    dense = find_stereo(path)
+    folder = find_model(path) if dense is None else dense / "sparse"
     if folder is None:
         what = "the folder holds no COLMAP model (no cameras.bin or cameras.txt)"
         raise FormatError(path, what if path.is_dir() else "there is no such folder")
-    models = {part: read_model(part) for part in _parts(path, folder)}
+    parts = _parts(path, folder) if dense is None else [folder]
+    models = {part: read_model(part) for part in parts}
     return max(models, key=lambda part: len(models[part].images)), models
 
 
+def _stereo_depth(dense: Path | None, name: str) -> Path | None:
+    if dense is None:
+        return None
+    depths = dense / "stereo" / "depth_maps"
+    found = (below(depths, f"{name}.{kind}.bin") for kind in _STEREO)
+    return next((path for path in found if path.is_file()), None)
+
+
+def _unposed(posed: set[Path]) -> list[Path]:
+    """Lists pictures beside those of a model, in the order of their names."""
+    suffixes = {path.suffix for path in posed}
+    beside = {file for place in {path.parent for path in posed} for file in _files(place)}
+    return sorted(file for file in beside - posed if file.suffix in suffixes)
+
+
 def _parts(path: Path, folder: Path) -> list[Path]:
-    """Finds all numbered models of a capture.
+    """Lists the models, one for every part of a capture that COLMAP could not join.
 
     A part without its images is left out where another one is whole: some keep only a piece of it.
     """
@@ -136,22 +203,24 @@ def _has_images(folder: Path) -> bool:
 
 
 def _left_out(
-    folder: Path, models: Mapping[Path, ColmapModel], image_paths: tuple[Path, ...]
+    folder: Path, models: Mapping[Path, ColmapModel], unposed: Sequence[Path]
 ) -> str | None:
-    """Describes the other models, and the images without a pose in this one."""
-    posed = set(image_paths)
-    suffixes = {path.suffix for path in posed}
-    beside = {file for place in {path.parent for path in posed} for file in _files(place)}
-    num_unposed = sum(file.suffix in suffixes for file in beside - posed)
-    number = len(posed)
-    said = [f"{number} of {number + num_unposed} pictures have a pose"] if num_unposed else []
-    if len(models) > 1:
-        others = [str(len(models[part].images)) for part in models if part != folder]
+    """Writes sentences on the other models and the images that this one has no pose for."""
+    number = len(models[folder].images)
+    total = number + len(unposed)
+    said: list[str] = []
+    if unposed and number < _FAILED * total:
         said.append(
-            f"COLMAP did not join all: of its {len(models)} models {folder.parent.name}/"
-            f"{folder.name} is used, with {number} pictures; the other "
-            f"{'has' if len(others) == 1 else 'ones have'} {', '.join(others)}"
+            f"The reconstruction failed for most pictures: only {number} of {total} have a pose, "
+            "and the rest of this page is about these"
         )
+    elif unposed:
+        said.append(f"{number} of {total} pictures have a pose")
+    if len(models) > 1:
+        said += _other_models(folder, models)
+    if unposed:
+        names = {image.name for model in models.values() for image in model.images}
+        said += _nowhere([path.name for path in unposed if path.name not in names])
     broken = [part.name for part in _numbered(folder) if not _has_images(part)]
     if broken:
         names = ", ".join(f"{folder.parent.name}/{name}" for name in broken)
@@ -161,11 +230,56 @@ def _left_out(
     return f"{text[0].upper()}{text[1:]}." if text else None
 
 
+def _other_models(folder: Path, models: Mapping[Path, ColmapModel]) -> list[str]:
+    """Names the models that were not joined, and where pictures in between would join them."""
+    names = {part: sorted(i.name for i in model.images) for part, model in models.items()}
+    own = set(names[folder])
+    said: list[str] = []
+    for part in models:
+        if part == folder:
+            continue
+        shared, end = len(own.intersection(names[part])), _gap(names[folder], names[part])
+        text = (
+            f"{part.parent.name}/{part.name} has {len(names[part])} ({names[part][0]} to "
+            f"{names[part][-1]})"
+        )
+        if shared:
+            text += f", {shared} of them in both: colmap model_merger may join them"
+        elif end is not None:
+            text += f": pictures between {end[0]} and {end[1]} would join it"
+        said.append(text)
+    return [
+        f"COLMAP did not join all: of its {len(models)} models {folder.parent.name}/{folder.name} "
+        f"is used, with {len(own)} pictures; {'; '.join(said)}"
+    ]
+
+
+def _gap(own: list[str], others: list[str]) -> tuple[str, str] | None:
+    """Finds two neighbors in the order of names of which one belongs to each of two models."""
+    if not own or not others:
+        return None
+    of_both = sorted([(name, True) for name in own] + [(name, False) for name in others])
+    pairs = [(a, b) for (a, first), (b, second) in itertools.pairwise(of_both) if first != second]
+    return pairs[0]
+
+
+def _nowhere(names: list[str]) -> list[str]:
+    """Says which pictures join no model."""
+    if not names:
+        return []
+    shown = ", ".join(names[:_MOST_NAMED])
+    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+    return [f"no model has {shown}{more}: take pictures between them and their neighbors"]
+
+
 def _odd_lenses(model: ColmapModel) -> list[str]:
-    """Names an implausible lens: poses and points that were fitted with it are wrong, too."""
+    """Names a lens that cannot be true.
+
+    Then the poses and points, fitted with it, are not either.
+    """
     odd = [
-        f"camera {number} (focal length {max(lens.intrinsics[:2]):.0f} px, distortion "
-        f"{max(map(abs, lens.distortion.values()), default=0.0):.3g})"
+        f"camera {number} (focal lengths {lens.intrinsics[0]:.0f} and {lens.intrinsics[1]:.0f} px, "
+        f"distortion {max(map(abs, lens.distortion.values()), default=0.0):.3g})"
         for number, lens in sorted(model.cameras.items())
         if not _is_plausible(lens)
     ]
@@ -180,6 +294,8 @@ def _odd_lenses(model: ColmapModel) -> list[str]:
 def _is_plausible(lens: Lens) -> bool:
     low, high = _FOCAL_RATIOS
     focals, side = lens.intrinsics[:2], max(lens.width, lens.height)
+    if max(focals) > _SQUARE * min(focals):
+        return False
     is_bent = any(abs(value) > _MAX_EXTRA for value in lens.distortion.values())
     if is_bent and lens.model in _SERIES:
         return False

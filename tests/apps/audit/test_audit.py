@@ -49,7 +49,7 @@ from tests.apps.audit.room import (
 
 VOXEL = 0.15
 SETTINGS = AuditSettings(voxel_size=VOXEL, views=3, folds=4, num_places=16, num_standpoints=8)
-FEW_VIEWS = replace(SETTINGS, voxel_size=None, views=2)
+FEW_VIEWS = replace(SETTINGS, voxel_size=None, views=2, surfaces="points")
 NO_VIEWS = replace(SETTINGS, views=0)
 
 

@@ -1,0 +1,272 @@
+"""Surfaces of a capture without a depth camera, from the best that there is.
+
+    stereo    COLMAP's depth maps, where they lie beside the images
+    sweep     a plane sweep at the poses (`captures.sweep`), by default
+    model     depth rendered from a trained splat
+    points    the sparse points alone
+
+Each says less than a depth camera does, and what it does not say is not known.
+
+Shape symbols: n images; h, w size of an image; k points.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from r3jax.captures.alignment import evenly_spaced
+from r3jax.captures.settings import Surfaces
+from r3jax.captures.source import Picture, Source, projected
+from r3jax.captures.sweep import Photo, agreed_depth, choose_sources, sweep
+from r3jax.errors import InputError
+from r3jax.splatting.ply import read_scene
+from r3jax.splatting.render import render
+
+_SWEPT_SIDE = 384
+"""Photos are thinned until their longer side has no more pixels: a voxel is no finer."""
+
+_FEWEST_PHOTOS = 3
+"""Depth takes an image and two others that agree."""
+
+_LEAST_KEPT = 0.1
+"""A sweep that keeps a smaller share of the pixels has failed: the poses or the lens are wrong."""
+
+_CONTRADICTED = 0.1
+"""As has one that lies off the points by more than this share of their depth, in the median."""
+
+Progress = Callable[[str, int], None]
+"""As in `apps.audit`: a stage and its steps, then an empty name after each step."""
+
+
+def with_surfaces(
+    source: Source,
+    wanted: Surfaces = "auto",
+    model: Path | None = None,
+    on_progress: Progress = lambda stage, steps: None,
+) -> Source:
+    """Gives a capture the best surfaces that it can have, or those that are wanted.
+
+    Args:
+        source: the capture as it was opened.
+        wanted: `auto` sweeps where there is no depth, and keeps the points where that fails.
+        model: a trained splat in the capture's coordinates, whose depth is taken instead.
+        on_progress: for a progress bar.
+
+    Raises:
+        InputError: what is wanted cannot be had.
+        FormatError: an image that is missing or broken.
+        SceneFileError: the splat cannot be read.
+    """
+    if model is not None:
+        return modeled(source, model, on_progress)
+    if wanted == "depth" and not source.is_dense:
+        raise InputError(
+            f"{source.name}: there are no depth images: --surfaces sweep computes depth from photos"
+        )
+    if wanted == "points" and source.is_dense:
+        raise InputError(f"{source.name}: depth images are better than points: drop --surfaces")
+    if wanted in ("depth", "points") or (wanted == "auto" and source.is_dense):
+        return source
+    why = _why_not_swept(source)
+    if why is None:
+        found = swept(source, on_progress)
+        why = _failed(source, found)
+        if why is None:
+            return found
+    if wanted == "sweep":
+        raise InputError(f"{source.name}: no depth can be swept from its photos: {why}")
+    return source if source.reconstruction is None else _remarked(source, why)
+
+
+def _remarked(source: Source, why: str) -> Source:
+    said = f"No depth could be swept from the photos ({why}): only points are judged."
+    return dataclasses.replace(source, remark=f"{source.remark} {said}" if source.remark else said)
+
+
+def _why_not_swept(source: Source) -> str | None:
+    if source.photograph is None:
+        return "the pictures are not there"
+    if source.is_dense:
+        return "it has depth images already"
+    if len(source) < _FEWEST_PHOTOS:
+        return f"it takes {_FEWEST_PHOTOS} pictures, here are {len(source)}"
+    return None
+
+
+_OPAQUE = 0.8
+"""Opacity from which on a splat's pixel has a depth."""
+
+_COVERED = 0.3
+"""A splat that covers less of the pictures on average is of another place or scale."""
+
+_MISFIT = 0.25
+"""As is one whose depth is off the points by more than this share, in the median."""
+
+_ALIKE = 0.3
+"""And one whose renderings correlate less with the pictures, in the median."""
+
+_COMPARED = 12
+"""Pictures that a splat is compared with."""
+
+
+def modeled(
+    source: Source, path: Path, on_progress: Progress = lambda stage, steps: None
+) -> Source:
+    """Gives a capture depth that is rendered from a trained splat.
+
+    Opacity is its confidence; pixels whose depth two other images contradict are holes.
+
+    Args:
+        source: the images.
+        path: the splat, in the capture's coordinates.
+        on_progress: for a progress bar.
+
+    Raises:
+        InputError: the splat is of another place or scale than the cameras; says by how much.
+        SceneFileError: it cannot be read.
+    """
+    scene = read_scene(path)
+    side = max(max(lens.width, lens.height) for lens in source.lenses)
+    stride = max(1, -(-side // _SWEPT_SIDE))
+    thin = dataclasses.replace(source, stride=stride)
+    on_progress("rendering the splat", len(source))
+    photos: list[Photo] = []
+    colors: list[np.ndarray] = []
+    depths: list[np.ndarray] = []
+    alike: list[float] = []
+    for index in range(len(source)):
+        camera = thin.camera(index)
+        lens = np.array([float(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy)])
+        drawn = render(scene, camera, jnp.asarray(source.poses[index], dtype=jnp.float32))
+        rgb = np.clip(np.asarray(drawn.rgb), 0.0, 1.0)
+        gray = rgb.mean(axis=-1).astype(np.float32)
+        is_solid = np.asarray(drawn.alpha) >= _OPAQUE
+        depths.append(np.where(is_solid, np.asarray(drawn.depth), 0.0).astype(np.float32))
+        if source.photograph is not None:
+            photo, own = source.photograph(index, stride)
+            alike.append(_correlation(own[is_solid], gray[is_solid]))
+        else:
+            photo = np.rint(255.0 * rgb).astype(np.uint8)
+        colors.append(photo)
+        photos.append(Photo(gray, lens, source.poses[index]))
+        on_progress("", 1)
+    _check_model(source, thin, path, depths, alike)
+    shown = [_some_points(depth, photo) for depth, photo in zip(depths, photos, strict=True)]
+    others = choose_sources(photos, shown.__getitem__)
+    kept = [agreed_depth(own, depths, photos, chosen) for own, chosen in enumerate(others)]
+    read: Callable[[int], Picture] = lambda index: (colors[index], kept[index])
+    return dataclasses.replace(source, kind="model", stride=stride, read=read)
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+    if len(a) < 2 or a.std() < 1e-6 or b.std() < 1e-6:
+        return 0.0
+    return float(np.corrcoef(a, b)[0, 1])
+
+
+def _some_points(depth: np.ndarray, photo: Photo, step: int = 16) -> np.ndarray:
+    """Samples the points of some pixels, [k, 3] in the world."""
+    row, column = np.nonzero(depth[::step, ::step] > 0.0)
+    row, column = step * row, step * column
+    z = depth[row, column].astype(np.float64)
+    fx, fy, cx, cy = photo.lens
+    local = z * np.stack([(column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, np.ones_like(z)])
+    return local.T @ photo.pose[:3, :3].T + photo.pose[:3, 3]
+
+
+def _check_model(
+    source: Source, thin: Source, path: Path, depths: list[np.ndarray], alike: list[float]
+) -> None:
+    """Refuses a splat of another place or scale than the cameras."""
+    what = f"{path}: the splat is of another place or scale than {source.name}: "
+    todo = "; give the splat that was trained on this capture, in its coordinates"
+    covered = float(np.mean([(depth > 0.0).mean() for depth in depths]))
+    if covered < _COVERED:
+        raise InputError(f"{what}it covers {100 * covered:.0f} % of its pictures{todo}")
+    if not source.is_dense:
+        off: list[np.ndarray] = []
+        for index in evenly_spaced(len(source), _COMPARED).tolist():
+            off.append(_off(depths[index], thin, index, points_shown(source, index)))
+        ratio = 1.0 + np.concatenate(off)
+        if len(ratio) and np.median(np.abs(ratio - 1.0)) > _MISFIT:
+            raise InputError(
+                f"{what}its surfaces are {np.median(ratio):.2g} times as far as the points{todo}"
+            )
+    if alike and np.median(alike) < _ALIKE:
+        raise InputError(
+            f"{what}its renderings and the pictures correlate by {np.median(alike):.2f} only{todo}"
+        )
+
+
+def swept(source: Source, on_progress: Progress = lambda stage, steps: None) -> Source:
+    """Gives a capture depth swept from its photos, at most `_SWEPT_SIDE` pixels wide.
+
+    Args:
+        source: images with points.
+        on_progress: for a progress bar.
+    """
+    photograph = source.photograph
+    assert photograph is not None
+    side = max(max(lens.width, lens.height) for lens in source.lenses)
+    stride = max(1, -(-side // _SWEPT_SIDE))
+    thin = dataclasses.replace(source, stride=stride)
+    on_progress("reading photos", len(source))
+    photos: list[Photo] = []
+    colors: list[np.ndarray] = []
+    points: list[np.ndarray] = []
+    for index in range(len(source)):
+        rgb, gray = photograph(index, stride)
+        colors.append(rgb)
+        camera = thin.camera(index)
+        lens = np.array([float(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy)])
+        photos.append(Photo(gray, lens, source.poses[index]))
+        points.append(points_shown(source, index))
+        on_progress("", 1)
+    on_progress("sweeping depth from photos", len(source))
+    found = sweep(photos, points.__getitem__, lambda: on_progress("", 1))
+    # What a mask hides has no brightness.
+    depths = [depth * (photo.gray > 0.0) for depth, photo in zip(found, photos, strict=True)]
+
+    def read(index: int) -> Picture:
+        return colors[index], depths[index]
+
+    return dataclasses.replace(source, kind="sweep", stride=stride, read=read)
+
+
+def points_shown(source: Source, index: int) -> np.ndarray:
+    """Lists the sparse points that an image shows, [k, 3] in the capture's coordinates."""
+    _, depth = source.read(index)
+    camera, pose = source.camera(index), source.poses[index]
+    row, column = np.nonzero((depth > 0.0) & np.isfinite(depth))
+    z = depth[row, column].astype(np.float64)
+    x = (column + 0.5 - float(camera.cx)) / float(camera.fx)
+    y = (row + 0.5 - float(camera.cy)) / float(camera.fy)
+    return (z * np.stack([x, y, np.ones_like(x)])).T @ pose[:3, :3].T + pose[:3, 3]
+
+
+def _failed(source: Source, found: Source) -> str | None:
+    """Says why swept depth is not believed; None: it is."""
+    kept: list[float] = []
+    off: list[np.ndarray] = []
+    for index in range(len(source)):
+        _, depth = found.read(index)
+        kept.append(float((depth > 0.0).mean()))
+        off.append(_off(depth, found, index, points_shown(source, index)))
+    if np.mean(kept) < _LEAST_KEPT:
+        return f"the photos agree on {100 * np.mean(kept):.1f} % of their pixels only"
+    ratio = np.concatenate(off)
+    median = float(np.median(np.abs(ratio))) if len(ratio) else 0.0
+    if median > _CONTRADICTED:
+        return f"it is {100 * median:.0f} % off the points, so lens or poses are likely wrong"
+    return None
+
+
+def _off(depth: np.ndarray, found: Source, index: int, points: np.ndarray) -> np.ndarray:
+    """Computes by which share of their depth an image's depth is off its points, [k]."""
+    place = projected(found.camera(index), found.poses[index], points)
+    row, column = place.row[place.is_in].astype(int), place.column[place.is_in].astype(int)
+    said, z = depth[row, column], place.z[place.is_in]
+    return (said / z - 1.0)[said > 0.0]
