@@ -216,6 +216,6 @@ class _WithoutLoops:
         self._hook = hook
 
     def __call__(self, unraisable: Any) -> None:
-        """Python's `sys.unraisablehook`."""
+        """Handles Python's `sys.unraisablehook`."""
         if str(unraisable.exc_value) != "Event loop is closed":
             self._hook(unraisable)

@@ -286,7 +286,7 @@ def _from_dlpack(name: str, value: Any) -> np.ndarray | Array:
 
 
 def color_image(rgb: Any) -> Float[Array, "H W 3"]:
-    """Colors in [0, 1] from 8-bit ones, or from floats that are so already.
+    """Converts 8-bit colors to [0, 1]; floats must be so already.
 
     Raises:
         ValueError: another shape, no pixels, whole numbers of another size.

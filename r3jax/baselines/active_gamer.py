@@ -184,7 +184,7 @@ class Draw:
 
 
 def empty_pools(grid_shape: Sequence[int], cell_size: float) -> Pools:
-    """Pools for a grid in which nothing is known yet."""
+    """Makes pools for a grid in which nothing is known yet."""
     pools: list[Pool] = []
     for stage in STAGES:
         num_places = len(stage.columns(grid_shape, cell_size)) * len(stage.heights)
@@ -240,7 +240,7 @@ def draw_candidates(
 def _best_remembered(
     pool: Pool, is_open: np.ndarray, travel: Travel, cells: np.ndarray, stage: int, num: int
 ) -> Draw:
-    """Up to `num` of the open candidates [P, D]: the greatest gains, then the nearest."""
+    """Selects up to `num` open candidates [P, D]: the greatest gains, then the nearest."""
     place, direction = np.nonzero(is_open)
     positions = travel.stops(cells[place])
     distance = np.linalg.norm(positions - travel.start, axis=1)

@@ -81,7 +81,7 @@ class Regions:
 def low_confidence(
     state: MapState, seen: Sightings, grid: OccupancyGrid
 ) -> tuple[Int[Array, "X Y Z"], Float[Array, "3 X Y Z"]]:
-    """Per cell the number of voxels of low confidence, and the sum of their normals."""
+    """Counts the voxels of low confidence per cell, and sums their normals."""
     cell = world_to_cell(grid, state.center.T)
     shape = grid.log_odds.shape
     is_low = state.present & (seen.confidence < LOW_CONFIDENCE)
@@ -131,7 +131,7 @@ def regions_of(
 def aimed_views(
     travel: Travel, regions: Regions, num: int, *, key: Array
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Up to `num` places to look at regions from, for the nearest regions first.
+    """Finds up to `num` places to view regions from, for the nearest regions first.
 
     At most five for each: safe and reachable, 0.3 to 2 m from the region's center, within 60
     degrees of its normal, the straight line to its center free up to the region itself.
@@ -213,7 +213,7 @@ def _draw_directions(normals: np.ndarray, rng: np.random.Generator) -> np.ndarra
 
 
 def _is_clear(travel: Travel, places: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """Which lines from places to the centers of cells run through free cells and that cell, [n].
+    """Checks which lines from places to cells run through free cells and that cell, [n].
 
     Every quarter of a cell is looked at: what a line only grazes does not hide its end.
     """
@@ -299,7 +299,7 @@ class ActiveGS(GreedyPolicy):
         return replace(state, memory=glance(before, touched, map_state, frame, reach))
 
     def draw(self, situation: Situation, *, key: Array) -> Drawn:
-        """Up to `num_frontier` views of regions of interest; the others local, turned anyhow."""
+        """Draws up to `num_frontier` views of regions of interest, and other views nearby."""
         seen = aligned(situation.memory, situation.map_state)
         count, normal_sum = low_confidence(situation.map_state, seen, situation.scoring_grid)
         drawn = draw_views(

@@ -83,7 +83,7 @@ def rendering_utility(seen: Seen, max_range: Float[Array, ""]) -> Float[Array, "
 def cells_in_sight(
     cells: Cells, camera: Camera, pose: Float[Array, "4 4"], seen: Seen, max_range: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """Unexplored cells whose center lies in the image, in range and before what is rendered."""
+    """Counts unexplored cells in the image, in range and before the rendered surface."""
     centers = jnp.stack([cells.x, cells.y, cells.z], axis=1)
     pixels, z = project(camera, transform(invert_pose(pose), centers))
     column, row = jnp.floor(pixels[:, 0]), jnp.floor(pixels[:, 1])
@@ -121,7 +121,7 @@ def _scores(
 
 
 def doubtful(online: OnlineMap, grid: OccupancyGrid) -> tuple[np.ndarray, np.ndarray]:
-    """Per cell the solid Gaussians of low confidence [X, Y, Z], the sum of normals [3, X, Y, Z]."""
+    """Counts the Gaussians of low confidence [X, Y, Z], and sums normals [3, X, Y, Z]."""
     scene, shape = online.scene, grid.log_odds.shape
     opacity = jax.nn.sigmoid(scene.opacity_logits)
     is_low = (confidence(online.marks) < LOW_CONFIDENCE) & (opacity > SURFACE_OPACITY)
@@ -153,7 +153,7 @@ class ActiveGSOnline(OnlinePolicy):
         return replace(online, marks=marks)
 
     def draw(self, situation: Situation, *, key: Array) -> Drawn:
-        """Up to `num_frontier` views of regions of interest; the others local, turned anyhow."""
+        """Draws up to `num_frontier` views of regions of interest, and other views nearby."""
         count, normal_sum = doubtful(memory_of(situation), situation.scoring_grid)
         drawn = draw_views(situation, self.config, count, normal_sum, key=key)
         return Drawn(drawn, situation.memory)

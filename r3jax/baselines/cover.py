@@ -72,7 +72,7 @@ class Cover(GreedyPolicy):
     source = "COVER of NBV-Gym, CVPR 2026, plus unexplored cells"
 
     def score(self, situation: Situation, candidates: Candidates, *, key: Array) -> Scored:
-        """New directions (`rendering`) and unexplored cells (`exploration`) of every view."""
+        """Scores each view by new directions (`rendering`) and unexplored cells (`exploration`)."""
         del key
         state = situation.map_state
         seen = SeenBins(state.visited, state.num_bins)

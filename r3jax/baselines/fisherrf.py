@@ -68,7 +68,7 @@ def information(
     T_world_camera: Float[Array, "4 4"],
     form: Form,
 ) -> tuple[GaussianScene, Array]:
-    """H of a view for every parameter but the rotations, and how many intersections had no room."""
+    """Computes H of a view for all parameters but rotations, and counts dropped intersections."""
     behind = jnp.asarray(form.background, dtype=jnp.float32)
     squares, overflow = pixel_squares(scene, camera, T_world_camera, behind, config)
     squares = eqx.tree_at(lambda s: s.quats, squares, jnp.zeros_like(squares.quats))

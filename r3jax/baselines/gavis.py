@@ -182,7 +182,7 @@ def unknown_share(
 
 
 def entropy(share: Float[Array, "*C h w"], beliefs: Beliefs) -> Float[Array, "*C h w"]:
-    """H(u) of rays [nats]."""
+    """Computes H(u) of rays [nats]."""
     known = 1.0 - share
     # xlogy: 0 ln 0 is 0, at rays that are known, or not known, for certain.
     both = -jax.scipy.special.xlogy(share, share) - jax.scipy.special.xlogy(known, known)

@@ -102,7 +102,7 @@ def pixel_tallies(
 def _composited(
     scene: GaussianScene, camera: Camera, pose: Float[Array, "4 4"], config: RasterConfig
 ) -> tuple[tuple[Cloud, Array, Images, Drawn], Int[Array, ""]]:
-    """What the kernels take: cloud, view, images and what is drawn of it; and the overflow."""
+    """Composites a view: the cloud, view, images and lists for the kernels; and the overflow."""
     zeros = jnp.zeros((scene.capacity, 2))
     (_, totals), found = composite_forward(*arguments(scene, camera, pose, zeros, config))
     return found, totals[1]

@@ -23,7 +23,7 @@ _NOISE = 0.06
 def pixel_normals(
     camera: Camera, depth: Float[Array, "H W"], valid: Bool[Array, "H W"], step: Float[Array, ""]
 ) -> Float[Array, "3 P"]:
-    """Normals towards the camera in its frame, scaled so that sums of them stay unbiased.
+    """Estimates normals towards the camera in its frame, scaled so that sums stay unbiased.
 
     A pixel's vector m is n / |n . p| times its depth: m . (u, v, 1) = -1 on its own ray, so that
     it never faces away. A pair that is bent (one side lies on another surface, by more than
@@ -54,7 +54,7 @@ def pixel_normals(
 def _slope(
     inverse: Float[Array, "H W"], limit: Float[Array, "H W"], width: int, *, axis: int
 ) -> Float[Array, "H W"]:
-    """Least-squares change of the inverse depth per pixel along an axis; 0 without any pair."""
+    """Fits the change of the inverse depth per pixel along an axis; 0 without any pair."""
     rise, run = jnp.zeros_like(inverse), jnp.zeros_like(inverse)
     reach = 1
     while reach <= max(1, width // _PIXELS_PER_DEGREE):

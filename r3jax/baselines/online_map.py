@@ -216,7 +216,7 @@ def one_per_voxel(
 
 
 def turned_to(normals: np.ndarray) -> np.ndarray:
-    """Quaternions wxyz that turn the z axis to unit vectors [b, 3], along the shortest arc."""
+    """Computes quaternions wxyz that turn z to unit vectors [b, 3], along the shortest arc."""
     x, y, z = normals.T
     quats = np.stack([1.0 + z, -y, x, np.zeros_like(x)], axis=1)
     # Straight down there is no shortest arc: half a turn about x.
@@ -225,7 +225,7 @@ def turned_to(normals: np.ndarray) -> np.ndarray:
 
 
 def _rays(camera: Camera) -> np.ndarray:
-    """Rays (u, v, 1) of all pixels, row by row, [h w, 3]."""
+    """Computes the rays (u, v, 1) of all pixels, row by row, [h w, 3]."""
     fx, fy, cx, cy = (float(x) for x in (camera.fx, camera.fy, camera.cx, camera.cy))
     u = (np.arange(camera.width) + 0.5 - cx) / fx
     v = (np.arange(camera.height) + 0.5 - cy) / fy
@@ -480,7 +480,7 @@ def _gradient_of_view(
     rows: Int[Array, " r"],
     settings: MapSettings,
 ) -> tuple[tuple[GaussianScene, Float[Array, ""]], Array]:
-    """Gradient of a key frame's loss by some rows, its color and depth error, and the overflow."""
+    """Computes the gradient of a key frame's loss by rows, both errors, and the overflow."""
 
     def loss(part: GaussianScene) -> tuple[Array, tuple[Array, Array]]:
         seen, overflow = _show(config, part, camera, frame.T_world_camera)

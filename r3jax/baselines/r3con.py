@@ -98,7 +98,7 @@ class R3con(GreedyPolicy):
     def score(
         self, situation: Situation, candidates: Candidates, *, key: Array
     ) -> tuple[Candidates, dict[str, np.ndarray]]:
-        """Utility all round of every position, and the direction that it would look in."""
+        """Computes the utility all round every position, and its best direction."""
         del key
         positions, scoring = candidates.position, self.config.scoring
         places = jnp.asarray(positions, dtype=jnp.float32)

@@ -152,6 +152,6 @@ def _below(path: Path) -> str | None:
 
 
 def _is_known(path: Path) -> bool:
-    """True if a folder looks like something that can be opened, whether or not it is whole."""
+    """Checks whether a folder looks like something that can be opened, whole or not."""
     is_ours = (path / "run.json").exists() or is_recording(path)
     return is_ours or any(fits(path) for fits, _ in _FORMATS)

@@ -171,7 +171,7 @@ def _colors(table: np.ndarray) -> np.ndarray:
 
 
 def voxel_points(map_state: MapState) -> tuple[np.ndarray, np.ndarray]:
-    """Centers [m] and mean colors of the occupied voxels: [n, 3] float32 and [n, 3] uint8."""
+    """Reads centers [m] and mean colors of the occupied voxels, [n, 3] float32 and uint8."""
     occupied = np.asarray(map_state.present)
     centers = np.asarray(map_state.center).T[occupied]
     colors = np.rint(np.asarray(map_state.mean).T[occupied] * 255.0)

@@ -260,7 +260,7 @@ class PosedImages:
     def depth(self, index: int) -> np.ndarray | None:
         """Reads the depth of one image, pixel by pixel as in `rgb`, [H, W] float32; None without.
 
-        0 is no measurement, inf nothing within range.
+        0 means no measurement, inf nothing within range.
 
         Raises:
             FormatError: the file is missing, broken, or no depth image.
@@ -282,7 +282,7 @@ class PosedImages:
 
 
 def _fitted(lens: Lens, images: list[Path]) -> Lens:
-    """The lens in the size of its images, or as it is where their sides have another ratio."""
+    """Scales the lens to the size of its images; unchanged if their sides have another ratio."""
     sizes: Counter[tuple[int, int]] = Counter()
     for image in images:
         # What is wrong with an image is said when its pixels are read.

@@ -118,7 +118,7 @@ def read_matrix(path: Path, rows: int, columns: int, data: bytes | None = None) 
 
 
 def read_poses(path: Path) -> np.ndarray:
-    """Camera-to-world matrices [n, 4, 4], one a line, 16 numbers row by row.
+    """Reads camera-to-world matrices [n, 4, 4], one a line, 16 numbers row by row.
 
     Raises:
         FormatError: the file is missing or damaged, or a pose is not finite or not rigid.

@@ -69,7 +69,7 @@ def _list_images(folder: Path) -> dict[str, Path]:
 
 
 def _lens(source: Path, images: Sequence[Path]) -> Lens:
-    """Intrinsics from K.txt, the size from the first image that can be opened."""
+    """Reads the intrinsics from K.txt, and the size from the first image that can be opened."""
     K = read_matrix(source, 3, 3)
     with naming(images[0]):
         width, height = first_size(images, IMAGE_FORMATS)

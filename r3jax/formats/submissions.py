@@ -170,7 +170,7 @@ class Submission:
         return f"{self.policy['name']} (submitted)"
 
     def paths(self) -> list[np.ndarray]:
-        """Waypoints to each frame, [K, 3] float64 [m] each; the first frame has one: its place."""
+        """Lists the waypoints to each frame, [K, 3] float64 [m]; the first has its place only."""
         found = [self.frames[0].position[None]]
         for before, frame in zip(self.frames, self.frames[1:], strict=False):
             straight = np.stack([before.position, frame.position])

@@ -14,7 +14,7 @@ _pose_along = jax.jit(pose_along)
 
 
 def poses_at(positions: np.ndarray, looks: Sequence[str] | np.ndarray) -> np.ndarray:
-    """Poses without roll, [V, 4, 4] float64, at positions [V, 3] [m] along "+x", "-x", ..."""
+    """Makes poses without roll, [V, 4, 4] float64, at positions [V, 3] [m] along "+x", "-x", ..."""
     # Six poses, copied below: `pose_along` would dispatch to JAX once per view.
     axes: dict[str, np.ndarray] = {}
     for look in LOOKS:

@@ -111,7 +111,7 @@ def project(
 
 
 def pixel_rays(camera: Camera) -> Float[Array, "H W 3"]:
-    """Rays through the pixel centers in the camera's frame, scaled to z = 1 (not to length 1)."""
+    """Computes rays through the pixel centers in the camera's frame, with z = 1 (not length 1)."""
     u = (jnp.arange(camera.width, dtype=jnp.float32) + 0.5 - camera.cx) / camera.fx
     v = (jnp.arange(camera.height, dtype=jnp.float32) + 0.5 - camera.cy) / camera.fy
     # At z = 1 a ray times the z-depth is the point, without a square root.

@@ -76,7 +76,7 @@ def octahedral_cell(directions: Float[Array, "3 n"], size: int) -> Int[Array, " 
 
 
 def octahedral_direction(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Unit directions, [..., 3], of points (u, v) in [-1, 1]^2 of the octahedral map."""
+    """Computes unit directions, [..., 3], of points (u, v) in [-1, 1]^2 of the octahedral map."""
     # Negative z is the lower half: its triangles are folded out over the edges.
     z = 1.0 - np.abs(u) - np.abs(v)
     fold = np.maximum(-z, 0.0)
@@ -92,7 +92,7 @@ _MAP_SIZE = 128
 
 @functools.cache
 def nearest_bin_table(num: int) -> np.ndarray:
-    """Per octahedral cell the bins that can be nearest somewhere in it, [K, S * S] int32.
+    """Lists per octahedral cell the bins that can be nearest somewhere in it, [K, S * S] int32.
 
     Exact, not sampled: if c is the cell's center, r the angle to its farthest corner and d the
     angle from c to its nearest bin, then no bin farther than d + 2 r from c can be nearest.

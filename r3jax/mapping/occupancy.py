@@ -230,7 +230,7 @@ def frontier(grid: OccupancyGrid) -> Bool[Array, "X Y Z"]:
 
 @jax.jit
 def frontier_unexplored(grid: OccupancyGrid) -> Bool[Array, "X Y Z"]:
-    """Unexplored cells with a free face neighbor: the first layer of the unknown."""
+    """Finds unexplored cells with a free face neighbor: the first layer of the unknown."""
     return grid.unexplored & _has_face_neighbor(grid.free)
 
 
@@ -353,7 +353,7 @@ def _hit_cells(
 
 
 def _ray_slopes(camera: Camera) -> tuple[Float[Array, "H W"], Float[Array, "H W"]]:
-    """Slopes x / z and y / z of the rays through the pixel centers."""
+    """Computes the slopes x / z and y / z of the rays through the pixel centers."""
     rays = pixel_rays(camera)
     return rays[..., 0], rays[..., 1]
 
@@ -432,7 +432,7 @@ def _distance(grid: OccupancyGrid, point: Float[Array, " 3"]) -> Float[Array, "X
 
 
 def squared_distance(grid: OccupancyGrid, point: Float[Array, " 3"]) -> Float[Array, "X Y Z"]:
-    """Squared distance from a point to every cell's center [m^2]."""
+    """Computes the squared distance from a point to every cell's center [m^2]."""
     x, y, z = (
         jnp.square(
             grid.origin[axis]

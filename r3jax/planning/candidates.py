@@ -214,7 +214,7 @@ def local_random(travel: Travel, num: int, radius: float = 0.5, *, key: Array) -
 def region_of_interest(
     travel: Travel, targets: np.ndarray, num: int, *, key: Array
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Up to `num` positions from which randomly drawn target cells are in plain view.
+    """Draws up to `num` positions from which randomly drawn target cells are in plain view.
 
     For every draw a target is taken at random, and one of the nearest cells where the robot may
     stop that lie 0.3 to 2 m from it; the straight line between them must be known free. Large
@@ -249,7 +249,7 @@ def region_of_interest(
 
 
 def _stops_round(travel: Travel, target: np.ndarray) -> np.ndarray:
-    """Nearest cells where the robot may stop, if they lie at a distance to look at `target`.
+    """Finds the nearest cells to stop in, at a distance from which to view `target`.
 
     Asks a window round the target only: the work does not grow with the scene.
 
@@ -308,7 +308,7 @@ def random_directions(num: int, *, key: Array) -> np.ndarray:
 
 
 def poses_along(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Roll-free poses at positions [n, 3] that look along directions [n, 3]; [n, 4, 4] float64."""
+    """Makes roll-free poses [n, 4, 4] float64 at positions [n, 3] along directions [n, 3]."""
     # The function that scoring uses, too: a second formula would differ in the last bits.
     poses = _poses_along(
         jnp.asarray(positions, dtype=jnp.float32), jnp.asarray(directions, dtype=jnp.float32)

@@ -199,7 +199,7 @@ class GreedyPolicy(ABC):
     ) -> tuple[Decision | None, PlannerState, PlanInfo]:
         """Decides again among the best candidates of a decision that was made on less.
 
-        None: no path leads to any of them.
+        The decision is None if no path leads to any of them.
         """
         views, before = best_of(planned)
         rule = Rule(
@@ -418,7 +418,7 @@ def net_utility(
     lambda2: float,
     among: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> np.ndarray:
-    """U_view of each candidate, from its utility and path length [C].
+    """Computes U_view of each candidate from its utility and path length [C].
 
     U_view = utility / sum(utility) - lambda2 * path / sum(path), both sums over the reachable
     candidates; a sum of 0 leaves its term out. Unreachable: -inf. (Active-GS sums utilities over

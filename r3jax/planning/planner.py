@@ -297,7 +297,7 @@ def refuse(planner: Planner, decision: Decision, radius: float = 0.5) -> Planner
 
 
 def columns_in(grid: OccupancyGrid, corners: np.ndarray) -> np.ndarray:
-    """Columns of cells of which a polygon [k, 2] [m] holds some part, [X, Y] bool."""
+    """Finds the columns of cells that a polygon [k, 2] [m] overlaps, [X, Y] bool."""
     size, origin = float(grid.cell_size), np.asarray(grid.origin, np.float64)
     num = 4  # a zone thinner than a quarter of a cell may slip between these points
     x, y = (

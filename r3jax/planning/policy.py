@@ -176,7 +176,7 @@ class PlansAhead(Policy, Protocol):
     ) -> tuple[Decision | None, Any, PlanInfo]:
         """Decides again among the best candidates of a decision, on what has come in since.
 
-        None: no path leads to any of them, and the policy has to decide again.
+        The decision is None if no path leads to any of them: the policy must decide again.
         """
         ...
 

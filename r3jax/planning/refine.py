@@ -90,7 +90,7 @@ def refine_best(
 def _climbed(
     situation: Situation, starts: Candidates, config: PlannerConfig
 ) -> tuple[Candidates, dict[str, np.ndarray]]:
-    """The views where climbs from K starts end, and what each gains in exact utility [K]."""
+    """Finds the views where climbs from K starts end, and their gains in exact utility [K]."""
     limits, camera, scoring = situation.limits, situation.camera, config.scoring
     boxes = [
         free_box(situation.travel, position, config.refine_radius) for position in starts.position

@@ -117,7 +117,7 @@ def _towards(now: np.ndarray, goal: np.ndarray, most: float) -> np.ndarray:
 
 
 def direction_of(T_world_camera: np.ndarray) -> np.ndarray:
-    """Azimuth and elevation [2] of a pose [4, 4] without roll, as its level axis has it."""
+    """Computes azimuth and elevation [2] of a pose [4, 4] without roll, by its level axis."""
     return np.concatenate(angles_of(T_world_camera[None]))
 
 

@@ -24,7 +24,7 @@ Candidates = Any
 
 
 def padded_to(multiple: int, candidates: Candidates) -> Candidates:
-    """Candidates, the last one repeated until their number is a multiple."""
+    """Repeats the last candidate until their number is a multiple."""
 
     def pad(rows: Array) -> Array:
         missing = -rows.shape[0] % multiple

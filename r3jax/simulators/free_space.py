@@ -117,7 +117,7 @@ class GroundTruth:
         return points[has_ceiling[1:]] if has_ceiling[0] else points
 
     def seen_share(self, poses: np.ndarray) -> np.ndarray:
-        """Share of a 60 degree view that shows a surface, [V] in [0, 1], of `poses` [V, 4, 4]."""
+        """Measures which share of a 60 degree view at `poses` [V, 4, 4] shows a surface, [V]."""
         x = (np.arange(12) + 0.5) / 6.0 - 1.0
         x = x * math.tan(math.radians(30.0))
         cone = np.stack(np.broadcast_arrays(x[None], x[:, None], 1.0), axis=-1).reshape(-1, 3)
@@ -126,7 +126,7 @@ class GroundTruth:
         return np.isfinite(self._distances(origins, directions)).mean(axis=1)
 
     def frames(self, poses: np.ndarray, camera: Camera) -> Iterator[Frame]:
-        """Frames without noise and without limit of range at `poses` [V, 4, 4], one by one."""
+        """Yields frames without noise or limit of range at `poses` [V, 4, 4], one by one."""
         simulator = self._simulator.with_camera(camera, max_range=None)
         return (simulator.render(pose) for pose in poses)
 
@@ -185,7 +185,7 @@ class GroundTruth:
         return np.isfinite(self._distances(origins, directions)).mean(axis=1) > 0.8
 
     def _distances(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Lengths of rays [n, r, 3] up to the first surface, [n, r], in their directions' units."""
+        """Measures rays [n, r, 3] up to the first surface, [n, r], in units of their directions."""
         hits = self._rays.cast(
             np.ascontiguousarray(origins.reshape(-1, 3), dtype=np.float32),
             np.ascontiguousarray(directions.reshape(-1, 3), dtype=np.float32),

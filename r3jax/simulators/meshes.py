@@ -391,7 +391,7 @@ class MeshFile:
         return scene
 
     def _check_repeats(self) -> None:
-        """A small scene graph can repeat a mesh without end."""
+        """Refuses a scene graph that repeats its meshes too often."""
         rows = {name: _num_rows(mesh) for name, mesh in self.scene.geometry.items()}
         stored = sum(rows.values())
         repeated = sum(rows.get(name, 0) for _, name in self.placed)
@@ -621,7 +621,7 @@ def _material(file: MeshFile, source: Any, *, has_uv: bool) -> Material:
 
 
 def _as_unit(colors: np.ndarray) -> np.ndarray:
-    """Colors [n, 3 or 4] of any type as float32 [n, 3] in [0, 1]."""
+    """Converts colors [n, 3 or 4] of any type to float32 [n, 3] in [0, 1]."""
     colors = np.asarray(colors)[:, :3]
     if colors.shape[1] != 3:
         raise ForeignFileError(f"colors of {colors.shape[1]} channels: expected 3 or 4")

@@ -39,7 +39,7 @@ def level_pose(position: np.ndarray, yaw: float) -> np.ndarray:
 
 
 def places_beside(start: np.ndarray) -> np.ndarray:
-    """Six places [6, 3] [m] at the height of a start [3], `APART` from it and from each other.
+    """Finds six places [6, 3] [m] at the height of a start [3], `APART` from it and each other.
 
     A wall cannot lie between two such places where both have `MIN_CLEARANCE` around them.
     """
@@ -131,7 +131,10 @@ def _at_eye_height(points: np.ndarray, scene: TriangleScene) -> np.ndarray:
 
 
 def _enclosure(points: np.ndarray, scene: TriangleScene) -> tuple[np.ndarray, np.ndarray]:
-    """How enclosed each point is (2 inside, seen from the front; 1 inside; 0 open), nearest hit."""
+    """Rates how enclosed each point is, and measures its nearest hit.
+
+    The rate is 2 inside, seen from the front; 1 inside; 0 in the open.
+    """
     directions = fibonacci_lattice(_PROBES)
     hits = _cast(scene, points, directions)
     shape = (len(points), _PROBES)

@@ -107,7 +107,7 @@ def without_nans(scene: GaussianScene) -> GaussianScene:
 
 
 def _in_camera(means: Float[Array, "n 3"], T: Float[Array, "4 4"]) -> tuple[Array, Array, Array]:
-    """Coordinates in the camera's frame [m], one array each."""
+    """Computes coordinates in the camera's frame [m], one array each."""
     mx, my, mz = means[:, 0], means[:, 1], means[:, 2]
     x, y, z = (T[i, 0] * mx + T[i, 1] * my + T[i, 2] * mz + T[i, 3] for i in range(3))
     return x, y, z
@@ -116,7 +116,7 @@ def _in_camera(means: Float[Array, "n 3"], T: Float[Array, "4 4"]) -> tuple[Arra
 def _image_covariance(
     scene: GaussianScene, camera: Camera, R: Float[Array, "3 3"], x: Array, y: Array, z: Array
 ) -> tuple[Array, Array, Array]:
-    """J W S W^T J^T + 0.3 I as (xx, xy, yy) [px^2], with J the Jacobian of the projection.
+    """Computes J W S W^T J^T + 0.3 I as (xx, xy, yy) [px^2], with J the Jacobian of the projection.
 
     J is taken at a point at most 30 % of half the image outside the image: further out the
     linearization means nothing and would smear Gaussians over the whole image.
@@ -141,7 +141,7 @@ def _image_covariance(
 
 
 def rotation_rows(quats: Float[Array, "n 4"]) -> list[list[Array]]:
-    """Rotation matrices of quaternions wxyz of any length, as 3x3 lists of [n] arrays."""
+    """Computes rotation matrices of quaternions wxyz of any length, as 3x3 lists of [n] arrays."""
     squared = sum(quats[:, i] * quats[:, i] for i in range(4))
     inverse = 1.0 / jnp.sqrt(jnp.where(squared > 0.0, squared, 1.0))
     w, x, y, z = (quats[:, i] * inverse for i in range(4))

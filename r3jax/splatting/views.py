@@ -181,7 +181,7 @@ def check_views(views: Views) -> None:
 
 
 def area_average(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Box filter: each new pixel is the mean over its area, pixels cut in part count in part.
+    """Averages over the area of each new pixel (box filter); pixels cut in part count in part.
 
     Args:
         image: [H, W, c].
@@ -238,7 +238,7 @@ def median_depth(depth: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def _members(long: int, short: int) -> tuple[np.ndarray, np.ndarray]:
-    """Old pixels whose centers lie in each new one, [short, most], and which entries are real."""
+    """Finds the old pixels whose centers lie in each new one, [short, most], and the real ones."""
     owner = ((np.arange(long) * 2 + 1) * short) // (2 * long)  # exact: whole numbers
     first = np.searchsorted(owner, np.arange(short + 1))
     index = first[:-1, None] + np.arange(np.diff(first).max())[None, :]

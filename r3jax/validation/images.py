@@ -161,7 +161,7 @@ def _check_size(image: Any, size: tuple[int, int] | None) -> None:
 
 
 def _colors(image: Any) -> tuple[np.ndarray, np.ndarray | None]:
-    """As `masked_pixels`, of an open image."""
+    """Reads colors as `masked_pixels` does, of an open image."""
     if image.mode == "F" or image.mode.startswith("I"):
         return np.repeat(_eight_bits(np.asarray(image))[..., None], 3, axis=2), None
     if image.mode not in _WITH_ALPHA and "transparency" not in image.info:
@@ -188,7 +188,7 @@ def _eight_bits(gray: np.ndarray) -> np.ndarray:
 
 @contextmanager
 def _opened(path: Path | bytes, formats: Sequence[str]) -> Generator[Any]:
-    """An open image; whatever Pillow says of a broken one becomes one kind of error."""
+    """Opens an image; all errors of Pillow on a broken one become one kind."""
     from PIL import Image, UnidentifiedImageError
 
     if isinstance(path, Path):

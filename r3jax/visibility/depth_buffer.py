@@ -186,7 +186,7 @@ def _at_pixel(
 
 
 def pyramid(shape: tuple[int, int]) -> list[tuple[int, int]]:
-    """Heights and widths of all levels, the finest first, each half of the one before."""
+    """Lists heights and widths of all levels, the finest first, each half of the one before."""
     shapes = [shape]
     while max(shapes[-1]) > 1:
         height, width = shapes[-1]
@@ -254,7 +254,7 @@ def footprint(
 def _covered(
     middle: Float[Array, " n"], reach: Float[Array, " n"]
 ) -> list[tuple[Int[Array, " n"], Bool[Array, " n"], Float[Array, " n"]]]:
-    """The two pixels round a coordinate, and whether `reach` covers each center, and its offset.
+    """Finds the two pixels round a coordinate, which centers `reach` covers, and its offset.
 
     The pixel that holds the coordinate is always covered.
     """
@@ -272,7 +272,7 @@ def surface_limit(
     pixel_angle: float | Float[Array, ""],
     allowance: Float[Array, ""],
 ) -> Float[Array, "h w"]:
-    """Distance up to which voxels count as the surface in the buffer, not as behind it [m].
+    """Computes the distance up to which voxels count as the surface in the buffer [m].
 
     On a surface at angle a to the line of sight, voxels that lie one behind the other across it
     are 1 / cos(a) as far apart along the line: the allowance is stretched by that. It stays the

@@ -80,7 +80,7 @@ class PinholeView(eqx.Module):
         return 1.0 / self.camera.focal
 
     def in_camera(self, points: Coordinates) -> tuple[Array, Array, Array]:
-        """Coordinates in the camera's frame [m]."""
+        """Computes coordinates in the camera's frame [m]."""
         # Coordinates apart, as long vectors: no [n, 3] array, and R's transpose is its inverse.
         R, t = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
         offset = [points[i] - t[i] for i in range(3)]

@@ -344,7 +344,7 @@ def _check_points(points: ColmapPoints) -> None:
 
 
 def _sparse_points(points: ColmapPoints, index: Mapping[int, int]) -> SparsePoints:
-    """Points by index instead of by id. What a track says of images that are gone is left out."""
+    """Numbers points by index instead of by id. Tracks leave out images that are missing."""
     seen_point = np.repeat(np.arange(len(points)), points.track_lengths)
     known = np.array(sorted(index), np.int64)
     at = np.minimum(np.searchsorted(known, points.track_images), len(known) - 1)

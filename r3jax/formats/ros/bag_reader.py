@@ -193,7 +193,7 @@ class BagReading:
 def _matched(
     bag: AnyBag, images: ImageTimes, depths: ImageTimes, has_pose: np.ndarray, source: str
 ) -> tuple[ImageTimes, ImageTimes]:
-    """Color images that have a pose and depth, and the depth image nearest in time to each.
+    """Finds color images that have a pose and depth, and the depth image nearest in time to each.
 
     Raises:
         FormatError: there is none; says what is lacking.
@@ -212,7 +212,7 @@ def _matched(
 
 
 def _rgb(bag: AnyBag, images: ImageTimes, index: int, lens: Lens) -> np.ndarray:
-    """Colors [H, W, 3] uint8."""
+    """Reads colors [H, W, 3] uint8."""
     with naming(images.name(bag, index)):
         rgb = rgb_of(images.read(bag, index))
         if rgb.shape[:2] != (lens.height, lens.width):

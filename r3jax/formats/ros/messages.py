@@ -182,7 +182,7 @@ def _tent(image: np.ndarray) -> np.ndarray:
 
 
 def _from_yuv(rows: np.ndarray, first: int) -> np.ndarray:
-    """Colors [H, W, 3] uint8 of YUV 4:2:2, [H, 2 W] uint8, by BT.601 in its narrow range."""
+    """Converts YUV 4:2:2, [H, 2 W] uint8, to colors [H, W, 3] uint8 by narrow-range BT.601."""
     if rows.shape[1] % 4:
         raise ForeignFileError("an image of YUV 4:2:2 has an odd number of columns")
     pairs = rows.reshape(len(rows), -1, 4).astype(np.float32)

@@ -169,7 +169,7 @@ def _query(path: Path, sql: str, values: Sequence[Any] = ()) -> list[Any]:
 def _optimized(path: Path) -> dict[int, np.ndarray] | None:
     """Reads the poses of the robot by the node's id, [4, 4].
 
-    None if the graph was never optimized.
+    The result is None if the graph was never optimized.
     """
     columns = {row[1] for row in _query(path, "PRAGMA table_info(Admin)")}
     if not {"opt_ids", "opt_poses"} <= columns:
@@ -196,7 +196,7 @@ def _unzipped(blob: Any) -> bytes:
 
 
 def _poses(data: bytes) -> np.ndarray:
-    """Matrices [n, 4, 4] of rows of 12 float32."""
+    """Reads matrices [n, 4, 4] from rows of 12 float32."""
     poses = np.tile(np.eye(4), (len(data) // 48, 1, 1))
     poses[:, :3] = np.frombuffer(data, "<f4").reshape(-1, 3, 4)
     return poses

@@ -44,7 +44,7 @@ class Edge:
     """Quaternions x y z w, frame to parent, [4] each."""
 
     def at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Transforms `T_parent_frame` [n, 4, 4], and whether they are known [n]."""
+        """Interpolates transforms `T_parent_frame` [n, 4, 4], and marks the known ones [n]."""
         moves = np.tile(np.eye(4), (len(times), 1, 1))
         positions, rotations = np.stack(self.positions), np.stack(self.rotations)
         if not self.times:
@@ -139,7 +139,7 @@ class TransformTree:
         return min(times, default=0)
 
     def poses(self, chain: list[str], times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Poses of a chain's first frame in its last one, [n, 4, 4], and which are known [n].
+        """Computes poses of a chain's first frame in its last, [n, 4, 4], and which are known [n].
 
         Args:
             chain: of `chain`.

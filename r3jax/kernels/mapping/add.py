@@ -53,7 +53,7 @@ def _slot(hashed, probe, capacity):
 
 @parallel_kernel
 def _find_rows(table, keys, workers, rows):
-    """Row of each voxel of a chunk; the capacity where it has none (`table.find`)."""
+    """Finds the row of each voxel of a chunk; the capacity where it has none (`table.find`)."""
     capacity, count = table.shape[1], keys.shape[0]
     for worker in prange(workers):
         begin, end = worker * count // workers, (worker + 1) * count // workers
@@ -115,7 +115,7 @@ def _claim_rows(table, keys, rows):
 
 @inlined_fused
 def _combine(rows, mean, row, red, green, blue):
-    """One observation joins a row's moments (`join.combine_moments`)."""
+    """Adds one observation to a row's moments (`join.combine_moments`)."""
     before = rows.counts[row]
     if before == _ZERO:  # a new row, or one whose voxel was removed: its marks are void
         rows.resolution[row] = _ZERO
@@ -149,7 +149,7 @@ def _prefetch_row(rows, mean, row):
 
 @parallel_kernel
 def _join_rows(rows, mean, sums, found, camera, bins, lattice, workers):
-    """The observations of a chunk join their rows (`update.observe_voxels`, `join.join`)."""
+    """Adds the observations of a chunk to their rows (`update.observe_voxels`, `join.join`)."""
     capacity, num = rows.counts.shape[0], sums.shape[0]
     for worker in prange(workers):
         begin, end = worker * num // workers, (worker + 1) * num // workers

@@ -46,7 +46,7 @@ def camera_of(frame, voxel_size):
 
 @inlined_fused
 def fold(x, y, z, size):
-    """Octahedral cell of a direction, row * size + column (`geometry.sphere.octahedral_cell`)."""
+    """Finds the octahedral cell of a direction (`geometry.sphere.octahedral_cell`)."""
     inverse = _ONE / max(abs(x) + abs(y) + abs(z), _TINY)
     u, v = x * inverse, y * inverse
     is_lower = z < _ZERO
@@ -102,7 +102,7 @@ def center_of(key, row, voxel_size):
 
 @inlined_fused
 def _look(low, high, num, camera, size, looks, cells):
-    """Directions to a camera, their octahedral cells, and resolutions of some voxels."""
+    """Computes directions to a camera, their octahedral cells, and resolutions of some voxels."""
     in_wide_vectors()
     for i in range(num):
         center = center_of_words(low[i], high[i], camera.voxel_size)

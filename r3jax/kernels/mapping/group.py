@@ -39,7 +39,7 @@ _LOWEST, _HIGHEST = np.float32(-INDEX_LIMIT), np.float32(INDEX_LIMIT - 1)
 
 @inlined_fused
 def _copy_rows(depth, first, block):
-    """Depths of a block's rows and of those around it, with a column more on both sides.
+    """Copies depths of a block's rows and of those around it, with a column more on both sides.
 
     The border repeats its own pixels; what is no measurement is 0, what is out of range far.
     """
@@ -67,7 +67,7 @@ def _or(value, other):
 
 @inlined_fused
 def _median_row(above, here, below, median):
-    """Medians of the 3x3 neighborhoods of a row (`associate._median9`)."""
+    """Computes medians of the 3x3 neighborhoods of a row (`associate._median9`)."""
     in_wide_vectors()
     for j in range(1, here.shape[0] - 1):
         own = here[j]
@@ -86,7 +86,7 @@ def _inverse(depth):
 
 @inlined_fused
 def _breaks(before, depth, after, limit):
-    """True where the surface breaks between two neighbors of a pixel (`associate._breaks`)."""
+    """Checks if the surface breaks between two neighbors of a pixel (`associate._breaks`)."""
     before, after = _or(before, depth), _or(after, depth)
     step = max(abs(before - depth), abs(after - depth))
     bend = abs(_inverse(before) + _inverse(after) - _TWO * _inverse(depth))
@@ -113,7 +113,7 @@ def _drop_edges(block, medians, k, size, counted):
 
 @inlined_fused
 def _index(T, x, y, depth, size):
-    """Index of the voxel along one axis of the world, as a float (`voxels.voxel_index`).
+    """Computes the index of the voxel along one axis, as a float (`voxels.voxel_index`).
 
     Args:
         T: row of `T_world_camera` for that axis.
@@ -129,7 +129,7 @@ def _index(T, x, y, depth, size):
 
 @inlined_fused
 def _pack_row(depths, counted, columns, v, frame, size, low, high, spread):
-    """Packed keys of the voxels of a row's pixels, all ones where nothing counts."""
+    """Packs keys of the voxels of a row's pixels, all ones where nothing counts."""
     in_wide_vectors()
     reach, T = frame.max_range, frame.T_world_camera
     T_x = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
@@ -164,7 +164,7 @@ def _empty(slots):
 
 @inlined_fused
 def _fill_medians(block, medians, first, height):
-    """Medians of a block's rows and of one row on both sides; the image's border is repeated."""
+    """Computes medians of a block's rows and one row on both sides; the border is repeated."""
     last = block.shape[0] - _AROUND
     for k in range(_AROUND - 1, last + 1):
         if 0 <= first + k - _AROUND < height:
@@ -201,7 +201,7 @@ def _group_of(low, high, spread, shift, slots, keys, new):
 
 @inlined
 def _shift_for(num):
-    """Bits to drop from a word for a table of twice `num` slots, in which searches end."""
+    """Computes the bits to drop from a word for a table of twice `num` slots: searches end."""
     shift = 31
     while (1 << (32 - shift)) < 2 * num:
         shift -= 1

@@ -52,9 +52,9 @@ def _farthest_around(depth, row, column):
 
 @inlined_fused
 def project(key, first, num, frame, voxel_size, pixels, depths):
-    """Pixel and z-depth of each row from `first` on; -1 for rows out of the image or of range.
+    """Projects each row from `first` on to its pixel and z-depth; -1 out of the image or range.
 
-    Without a branch, so that LLVM turns the loop into vectors: most rows end here.
+    There is no branch, so that LLVM turns the loop into vectors: most rows end here.
     """
     in_wide_vectors()
     shape, T = frame.depth.shape, frame.T_camera_world

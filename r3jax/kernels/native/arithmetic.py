@@ -112,7 +112,7 @@ def middle_of(typingctx, word, other):
 
 @intrinsic
 def end_of(typingctx, word):
-    """Bits 10 to 30 of a word."""
+    """Extracts bits 10 to 30 of a word."""
     return types.uint32(types.uint32), lambda context, builder, sig, args: builder.lshr(
         args[0], _int(10)
     )
@@ -158,7 +158,7 @@ def high_word(typingctx, y, z):
 
 @intrinsic
 def fused(typingctx, a, b, c):
-    """Product of two floats plus a third with one rounding, whatever LLVM fuses by itself."""
+    """Multiplies two floats and adds a third with one rounding, whatever LLVM fuses by itself."""
 
     def codegen(context, builder, sig, args):
         return builder.fma(*args)

@@ -102,7 +102,7 @@ class _Library(JITCodeLibrary):
 
 
 def _is_large(module: Any) -> bool:
-    """Whether a function of a module is large, other than those that callers always take in."""
+    """Checks whether a function is large, other than those that callers always take in."""
     return any(
         _is_long(function)
         for function in module.functions
@@ -112,7 +112,7 @@ def _is_large(module: Any) -> bool:
 
 
 def _is_long(function: Any) -> bool:
-    """Whether a function has more than `LARGE` instructions, of which no more are looked at."""
+    """Checks whether a function has more than `LARGE` instructions; no more are counted."""
     instructions = (one for block in function.blocks for one in block.instructions)
     return next(itertools.islice(instructions, LARGE, None), None) is not None
 

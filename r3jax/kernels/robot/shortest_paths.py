@@ -77,7 +77,7 @@ def _steps(
 
 @functools.cache
 def _compiled() -> _Kernel:
-    """The kernel; compiled on the first call, and the disk keeps it for the next process."""
+    """Compiles the kernel on the first call; the disk keeps it for the next process."""
     return compiled_or_plain(_settle)  # only here: a command without paths need not wait for Numba
 
 

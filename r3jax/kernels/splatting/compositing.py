@@ -52,7 +52,7 @@ _HALF, _ZERO, _ONE = np.float32(0.5), np.float32(0.0), np.float32(1.0)
 
 @inlined
 def alpha_in_row(record, dx, across, slant, dy):
-    """Alpha before it is cut off at 0.99, and 0 where it is below 1/255, for a row of pixels.
+    """Computes alpha for a row of pixels before it is clipped at 0.99; 0 below 1/255.
 
     Args:
         record: the Gaussian.
@@ -245,7 +245,7 @@ def _gradient_of_tile(
 
 @parallel_kernel
 def gradient_of_all(lists, records, images, gradients, workers, slots):
-    """Gradients of all intersections, those of a Gaussian side by side (`GRADIENT_SIZE` each)."""
+    """Computes the gradients of all intersections, those of a Gaussian side by side."""
     list_ids, list_slots, list_rows, tile_starts, tile_ends = lists
     columns = -(-images[2].shape[1] // TILE)
     next_tile = np.zeros(1, np.int64)

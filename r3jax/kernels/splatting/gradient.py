@@ -59,7 +59,7 @@ def sum_slots(start, count, size, numbers, slots, sums):
 
 @inlined_fast
 def conic_gradient(sums, xx, xy, yy):
-    """Gradients by the center (2) and by the covariance xx, xy, yy (3).
+    """Computes the gradients by the center (2) and by the covariance xx, xy, yy (3).
 
     s = d^T K d / 2 with K the inverse of the covariance S; with M the sum of v d d^T and
     v = -dL/ds, dL/dS = K M K / 2 and dL/dcenter = -K (sum of v d).
@@ -177,7 +177,7 @@ def geometry_of(mean, quat, log_scales, view, size, room):
 
 @inlined_fast
 def center_gradient(g_u, g_v, center, slopes, view, room, g_view):
-    """Gradients by the center in the camera's frame: through its pixel, and through J R."""
+    """Computes the gradients by the center in the camera's frame: by its pixel, and by J R."""
     x, y, z = center
     g_rows, rows = room[24:30], room[9:15]
     g_x, g_z = _row_gradient(
@@ -191,7 +191,7 @@ def center_gradient(g_u, g_v, center, slopes, view, room, g_view):
 
 @kernel
 def _gradient_of_one(i, cloud, record, sums, view, size, room, g_cloud, g_view):
-    """Gradients of one Gaussian that was drawn; adds its share of the view's gradient."""
+    """Computes the gradients of one drawn Gaussian, and adds its share of the view's gradient."""
     means, quats, log_scales, logits, sh, _ = cloud
     g_means, g_quats, g_scales, g_logits, g_sh, g_offsets = g_cloud
     point = means[i]
@@ -219,7 +219,7 @@ def _gradient_of_one(i, cloud, record, sums, view, size, room, g_cloud, g_view):
 
 @kernel
 def _gradient_of_block(block, cloud, records, slots, view, size, g_cloud, g_view):
-    """Gradients of a block of Gaussians; 0 for those that were not drawn."""
+    """Computes the gradients of a block of Gaussians; 0 for those that were not drawn."""
     integers = records.view(np.int32)
     room, sums = np.empty(ROOM, np.float32), np.empty(10, np.float32)
     g_means, g_quats, g_scales, g_logits, g_sh, g_offsets = g_cloud
@@ -234,7 +234,7 @@ def _gradient_of_block(block, cloud, records, slots, view, size, g_cloud, g_view
 
 @parallel_kernel
 def gradient_of_cloud(cloud, records, slots, view, size, workers, g_cloud, g_view):
-    """Gradients by all parameters, and by the view, summed in a fixed order."""
+    """Computes the gradients by all parameters and by the view, summed in a fixed order."""
     blocks = -(-records.shape[0] // at.BLOCK)
     shares = np.zeros((blocks, at.VIEW_SIZE), np.float64)
     next_block = np.zeros(1, np.int64)

@@ -83,7 +83,7 @@ def forward_pass(cloud, view, workers, images, totals, records, lists):
 
 @kernel
 def backward_pass(cloud, view, workers, images, records, lists, gradients, g_cloud, g_view):
-    """Gradients by the cloud and the view, from those by the images; takes what forward wrote."""
+    """Computes the gradients by cloud and view from those by the images and the forward pass."""
     tile_starts, alpha = lists[3], images[2]
     size = alpha.shape[1], alpha.shape[0]
     slots = np.empty(tile_starts[-1] * at.GRADIENT_SIZE, np.float32)

@@ -156,7 +156,7 @@ def project_one(mean, quat, log_scales, logit, offset, view, width, height, scra
 
 @inlined_fast
 def direction_of(mean, view):
-    """Unit vector from the camera's center to the Gaussian, and 1 / distance (0 at the center)."""
+    """Computes the unit vector from camera to Gaussian, and 1 / distance (0 at the center)."""
     x, y, z = mean[0] - view[12], mean[1] - view[13], mean[2] - view[14]
     squared = x * x + y * y + z * z
     inverse = ONE / np.sqrt(squared) if squared > ZERO else ZERO

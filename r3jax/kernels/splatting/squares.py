@@ -136,7 +136,7 @@ def _squares_of_tile(
 
 @parallel_kernel
 def squares_of_all(lists, records, images, background, workers, slots):
-    """Moments of all intersections, those of a Gaussian side by side (`SLOT` floats each)."""
+    """Computes the moments of all intersections, those of a Gaussian side by side."""
     list_ids, list_slots, list_rows, tile_starts, tile_ends = lists
     columns = -(-images[2].shape[1] // TILE)
     next_tile = np.zeros(1, np.int64)
@@ -194,7 +194,7 @@ def _fill_columns(i, cloud, record, view, size, room, unit, g_view, g_sh, column
 
 @kernel
 def _squares_of_block(block, cloud, records, slots, view, size, squares):
-    """Squares of a block of Gaussians; 0 for those that were not drawn."""
+    """Computes the squares of a block of Gaussians; 0 for those that were not drawn."""
     integers = records.view(np.int32)
     room, sums = np.empty(ROOM, np.float32), np.empty(MOMENTS, np.float32)
     unit, columns = np.empty(9, np.float32), np.empty((6, 10), np.float32)
@@ -222,7 +222,7 @@ def _squares_of_block(block, cloud, records, slots, view, size, squares):
 
 @parallel_kernel
 def _squares_of_cloud(cloud, records, slots, view, size, workers, squares):
-    """Squares by all parameters, block by block."""
+    """Computes the squares by all parameters, block by block."""
     blocks = -(-records.shape[0] // at.BLOCK)
     next_block = np.zeros(1, np.int64)
     for _ in prange(workers):

@@ -74,7 +74,7 @@ def _tallies_of_tile(
 
 @parallel_kernel
 def _tallies_of_all(lists, records, value, counts, least, workers, slots):
-    """Tallies of all intersections, those of a Gaussian side by side."""
+    """Computes the tallies of all intersections, those of a Gaussian side by side."""
     list_ids, list_slots, list_rows, tile_starts, tile_ends = lists
     columns = -(-value.shape[1] // TILE)
     next_tile = np.zeros(1, np.int64)

@@ -64,7 +64,7 @@ def _read_row(image, y, row):
 
 @kernel
 def _blur_products(x, y, means):
-    """The window along a row of x, y, x x, y y and x y [5, padded]."""
+    """Filters a row of x, y, x x, y y and x y with the window [5, padded]."""
     for k in range(BORDER, x.shape[0] - BORDER, 16):
         mx, my, xx, yy, xy = splat(_ZERO), splat(_ZERO), splat(_ZERO), splat(_ZERO), splat(_ZERO)
         for tap in range(_WIDTH):
@@ -81,7 +81,7 @@ def _blur_products(x, y, means):
 
 @kernel
 def _blur_slopes(slopes, y, blurred):
-    """The window along row y of three maps [3, H, padded], to [3, padded]."""
+    """Filters row y of three maps [3, H, padded] with the window, to [3, padded]."""
     for k in range(BORDER, slopes.shape[2] - BORDER, 16):
         for which in range(3):
             row, total = slopes[which, y], splat(_ZERO)
@@ -101,7 +101,7 @@ def _down(ring, order, which, k):
 
 @inlined
 def _set_order(y, order):
-    """The places in a ring of the rows round the y-th."""
+    """Writes the places in a ring of the rows round the y-th."""
     for tap in range(_WIDTH):
         order[tap] = (y - _RADIUS + tap) % _WIDTH
 

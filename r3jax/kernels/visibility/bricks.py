@@ -42,7 +42,7 @@ _ONE = np.float32(1.0)
 
 @inlined
 def voxel_of(key, row):
-    """Index of the voxel in a row of the map along x, y and z (`geometry.voxels.unpack`)."""
+    """Unpacks the index of the voxel in a row of the map (`geometry.voxels.unpack`)."""
     low, high = np.int64(key[0, row]), np.int64(key[1, row])
     y = (low >> 21) | ((high & 1023) << 11)
     return (low & _LOW) - _LIMIT, y - _LIMIT, ((high >> 10) & _LOW) - _LIMIT

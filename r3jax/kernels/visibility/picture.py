@@ -34,7 +34,7 @@ def num_levels(side):
 
 @inlined
 def stride_of(side):
-    """Places from a pixel to the one below."""
+    """Computes the places from a pixel to the one below."""
     return side + 2 * RING
 
 

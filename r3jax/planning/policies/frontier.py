@@ -117,7 +117,7 @@ def _is_looked_at(centers: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray
 
 
 def _may_look(limits: Limits, place: np.ndarray, aim: np.ndarray) -> bool:
-    """Whether the allowed view from a place that comes nearest to a target counts as one of it."""
+    """Checks whether the nearest allowed view from a place counts as one of the target."""
     # Never 0 / 0: places nearer than `VIEW_DISTANCE` were dropped before.
     direction = (aim - place) / np.linalg.norm(aim - place)
     return bool(limits.nearness(place[None], direction[None])[0] >= _ATTEMPT_COSINE)
@@ -131,7 +131,7 @@ def nearest_views(
     *,
     key: Array,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Up to `num` places from which a target cell is in plain view, nearest by path first.
+    """Finds up to `num` places with a target cell in plain view, nearest by path first.
 
     Args:
         travel: where the robot may stop, and how far that is.

@@ -352,7 +352,7 @@ _Sight = tuple[np.ndarray, np.ndarray]
 def _apart(
     ranked: Sequence[int], views: Candidates, taken: Sequence[_Sight], num: int
 ) -> list[int]:
-    """Up to `num` of the views, in order, each apart from those before it and those taken."""
+    """Selects up to `num` views, in order, each apart from those before it and those taken."""
     chosen: list[int] = []
     is_left = np.ones(len(views.position), dtype=bool)
     for other in taken:

@@ -157,12 +157,12 @@ class Room:
         return self.stop >= 0
 
     def places(self, pixels: np.ndarray) -> np.ndarray:
-        """Centers of pixels given by flat index [...], [..., 2] [m]."""
+        """Computes the centers of pixels given by flat index [...], [..., 2] [m]."""
         index = np.stack(np.unravel_index(pixels, self.distance.shape), axis=-1)
         return self.origin + (index + 0.5) * self.pixel
 
     def path(self, column: tuple[int, int]) -> np.ndarray:
-        """Pixels' centers from the robot to where it stops in a column, [K, 2] [m]."""
+        """Lists the pixels' centers from the robot to its stop in a column, [K, 2] [m]."""
         pixels = [int(self.stop[column])]
         while self.previous[pixels[-1]] >= 0:
             pixels.append(int(self.previous[pixels[-1]]))
@@ -333,14 +333,14 @@ class _Known:
         return found
 
     def thin_obstacles(self) -> np.ndarray:
-        """Columns with an occupied cell, above the floor's own, that no voxel explains, [X, Y]."""
+        """Finds columns with an occupied cell above the floor that no voxel explains, [X, Y]."""
         lower = self.origin[2] + self.size * np.arange(self.free.shape[2])
         floor, step = self.floor[..., None], self.body.step
         holds_floor = (lower < floor + step) & (lower + self.size > floor - step)
         return (self.within & self.occupied & ~self.has_voxel & ~holds_floor).any(axis=2)
 
     def columns(self, blind: float, thin: np.ndarray) -> np.ndarray:
-        """Columns of which enough is known for the body to stand in them, [X, Y] bool."""
+        """Finds columns of which enough is known for the body to stand in them, [X, Y] bool."""
         known = (self.free | self.occupied | self.has_voxel | ~self.within).all(axis=2)
         radius = self.body.needed / self.size
         known |= _dilated(self.been, radius)
@@ -369,7 +369,7 @@ class _Known:
 def _search(
     distance: np.ndarray, own: np.ndarray, pixel: float, num: int, body: Body
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Shortest paths over the plan; of each column of cells its roomiest pixel that can be reached.
+    """Searches shortest paths over the plan, and the roomiest reachable pixel of each column.
 
     Returns:
         The pixel's flat index and the length of the path to it [m], [X, Y] each; and the flat index
@@ -401,7 +401,7 @@ def _floor_at(
     body: Body, voxels: np.ndarray, voxel_size: float, occupied: np.ndarray,
     origin: np.ndarray, size: float, position: np.ndarray,
 ) -> float:  # fmt: skip
-    """Height of the floor under the robot [m]: given, seen round it, or the box's lower bound."""
+    """Finds the height of the floor under the robot [m]: given, seen, or the box's lower bound."""
     if body.floor is not None:
         return body.floor
     gap = np.linalg.norm(voxels[:, :2] - position[:2], axis=1)
@@ -427,7 +427,7 @@ def _floor_map(
     voxels: np.ndarray, cells: np.ndarray, voxel_size: float, shape: tuple[int, ...],
     origin: np.ndarray, size: float, position: np.ndarray, start: float,
 ) -> np.ndarray:  # fmt: skip
-    """Height of the floor in each column [m], [X, Y]: up or down by a voxel from cell to cell."""
+    """Maps the height of the floor [m], [X, Y]: by at most a voxel up or down from cell to cell."""
     low = np.floor(origin[2] / voxel_size)
     num = int(np.ceil(shape[2] * size / voxel_size)) + 2
     level = np.clip(np.floor(voxels[:, 2] / voxel_size) - low, 0, num - 1).astype(np.int64)
@@ -470,7 +470,7 @@ def _dilated(mask: np.ndarray, radius: float) -> np.ndarray:
 
 
 def _blind_radius(camera: Camera | None, T_world_camera: np.ndarray, height: float) -> float:
-    """How far from the robot the image first shows the floor [m]; 0: it never does."""
+    """Computes how far from the robot the image first shows the floor [m]; 0: it never does."""
     if camera is None:
         return 0.0
     T = np.asarray(T_world_camera, np.float64)

@@ -10,7 +10,7 @@ from r3jax.mapping.occupancy import OccupancyGrid
 
 
 def explorable_cells(free: np.ndarray, unexplored: np.ndarray, reached: np.ndarray) -> np.ndarray:
-    """Unexplored cells that connect, through unexplored cells, to space the robot can enter.
+    """Finds unexplored cells that connect, through such cells, to space the robot can enter.
 
     A region of unexplored cells (connected over faces) counts as a whole if one of its cells
     has a face neighbor in the *known-free reachable space*: the free cells that connect over

@@ -64,7 +64,7 @@ class Limits:
         return np.clip(np.sum(nearest * directions, axis=-1), -1.0, 1.0)
 
     def allowed_axes(self, positions: np.ndarray, num_bins: int) -> np.ndarray:
-        """Axes of a panorama of B bins that a view at positions [C, 3] may have, [C, B] bool.
+        """Finds axes of a panorama of B bins that a view at positions [C, 3] may have, [C, B] bool.
 
         Those whose bins, caps of 1 / B of the sphere, reach into what is allowed. At least one is
         allowed everywhere, so that a tilt between the lattice's directions has its nearest one.
@@ -109,7 +109,7 @@ class Limits:
         return self.motion.seconds(length, float(self.turns(direction[None])[0]))
 
     def turns(self, directions: np.ndarray) -> np.ndarray:
-        """Angles of the rotations from the present view to those along directions [C, 3] [rad]."""
+        """Computes the angles from the present view to those along directions [C, 3] [rad]."""
         (azimuth_now,), (elevation_now,) = angles_of(self.T_world_camera[None])
         azimuth, elevation = angles_along(directions)
         return _angle_of_turn(wrapped(azimuth - azimuth_now), elevation - elevation_now)
@@ -178,7 +178,7 @@ def angles_of(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def angles_along(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Azimuth and elevation [rad] of the poses along directions [..., 3], [...] each."""
+    """Computes azimuth and elevation [rad] of the poses along directions [..., 3], [...] each."""
     x, y, z = np.moveaxis(directions, -1, 0)
     level = np.hypot(x, y)
     # As `pose_along` has it: the image's level axis is the world's x axis then.

@@ -112,7 +112,7 @@ class Motion:
         return self.heights is not None and self.heights_above == "start"
 
     def heights_from(self, start: float) -> tuple[float, float]:
-        """Allowed heights of the camera [m], world, of a robot that started at height `start`."""
+        """Computes the allowed heights of the camera [m], world, after a start at `start`."""
         if self.heights is None:
             return UNLIMITED
         base = start if self.is_relative else 0.0

@@ -105,7 +105,7 @@ class Travel:
         return int(x), int(y), int(z)
 
     def centers(self, cells: np.ndarray) -> np.ndarray:
-        """Centers [m] of cells given by index, [n, 3]."""
+        """Computes the centers [m] of cells given by index, [n, 3]."""
         return self.origin + (np.asarray(cells) + 0.5) * self.cell_size
 
     def stops(self, cells: np.ndarray) -> np.ndarray:
@@ -165,7 +165,7 @@ class Travel:
         return lengths
 
     def path(self, position: np.ndarray) -> np.ndarray:
-        """Waypoints [K, 3] [m] from the robot to a position; every segment is safe throughout.
+        """Plans waypoints [K, 3] [m] from the robot to a position; all of the path is safe.
 
         Raises:
             ValueError: there is no way; ask `lengths` first.
@@ -189,7 +189,7 @@ class Travel:
         return self._shortcut(np.concatenate([self.start[None], self.stops(cells), goal[None]]))
 
     def cells_along(self, waypoints: np.ndarray) -> np.ndarray:
-        """Cells of the grid that the path over waypoints [K, 3] [m] crosses, [X, Y, Z] bool."""
+        """Finds the cells that the path over waypoints [K, 3] [m] crosses, [X, Y, Z] bool."""
         from r3jax.kernels.robot.cells import segment_cells
 
         swept = np.zeros(self.usable.shape, dtype=bool)
@@ -232,7 +232,7 @@ class Travel:
         return self.scaled(a), self.scaled(b)
 
     def scaled(self, positions: np.ndarray) -> np.ndarray:
-        """Positions [..., 3] in cells, kept off the borders of the layers that are allowed."""
+        """Converts positions [..., 3] to cells, kept off the borders of the allowed layers."""
         scaled = (positions - self.origin) / self.cell_size
         if self.heights != UNLIMITED:
             num = self.usable.shape[2]

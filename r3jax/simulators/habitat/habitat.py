@@ -206,7 +206,7 @@ class HabitatSimulator:
             )
 
     def _agreement(self, found: np.ndarray, pose: np.ndarray, *, cull_back_faces: bool) -> float:
-        """Share of the pixels with a surface in which Habitat's depth [H, W] is the mesh's."""
+        """Computes the share of surface pixels in which Habitat's depth [H, W] is the mesh's."""
         mesh = self._mesh.with_camera(self._camera, max_range=None, cull_back_faces=cull_back_faces)
         known = np.asarray(mesh.render(pose).depth)
         known = np.where(np.isfinite(known), known, np.float32(0.0))
@@ -283,7 +283,7 @@ class _Habitat:
         _Habitat._current = weakref.ref(self)
 
     def observe(self, position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Colors [H, W, 3] uint8 and z-depth [H, W] float32 from a place in Habitat's world.
+        """Renders colors [H, W, 3] uint8 and z-depth [H, W] float32 at a place in Habitat's world.
 
         The arrays may be Habitat's own: the next call may change them.
 

@@ -167,7 +167,7 @@ def _release(embree: CDLL, device: int, scene: int) -> None:
 
 
 def _aligned(num_bytes: int) -> np.ndarray:
-    """Zeros on a boundary of 64 bytes, as embree's packets must be, uint8."""
+    """Allocates zeros on a boundary of 64 bytes, as embree's packets must be, uint8."""
     room = np.zeros(num_bytes + 64, np.uint8)
     start = -room.ctypes.data % 64
     return room[start : start + num_bytes]

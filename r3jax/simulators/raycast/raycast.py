@@ -187,7 +187,7 @@ class RaycastSimulator:
         return SurfaceDistance(self.world.vertices, self.world.faces)
 
     def _pixel_directions(self) -> np.ndarray:
-        """Rays through the pixel centers with z = 1, row by row, [H * W, 3] float32."""
+        """Computes rays through the pixel centers with z = 1, row by row, [H * W, 3] float32."""
         camera = self._camera
         x = (np.arange(camera.width) + 0.5 - float(camera.cx)) / float(camera.fx)
         y = (np.arange(camera.height) + 0.5 - float(camera.cy)) / float(camera.fy)
@@ -222,12 +222,12 @@ class RaycastSimulator:
         )
 
     def _pixel_steps(self, T: np.ndarray) -> np.ndarray:
-        """Change of the ray's direction from one column, and one row, to the next, [2, 3]."""
+        """Computes how the ray changes from one column, and one row, to the next, [2, 3]."""
         focal = np.array([[float(self._camera.fx)], [float(self._camera.fy)]])
         return (T[:3, :2].T / focal).astype(np.float32)
 
     def _look(self, T: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, Hits]:
-        """Colors [n, 3] and hits of rays `directions` [n, 3] from the camera."""
+        """Casts rays `directions` [n, 3] from the camera; returns colors [n, 3] and hits."""
         from r3jax.simulators.raycast.shading import shade
 
         steps = self._pixel_steps(T)

@@ -48,7 +48,7 @@ class TriangleScene:
             self._build_single(vertices, faces)
 
     def _build_single(self, vertices: np.ndarray, faces: np.ndarray) -> None:
-        """The same through embreex, one ray at a time."""
+        """Builds the scene through embreex, which casts one ray at a time."""
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 

@@ -210,7 +210,7 @@ def _moved(step, mirror, normal, per_along, direction, path, gradients):
 
 @inlined_fused
 def _measure(floats, steps, num):
-    """The footprint of each pixel: its longer axis in texels, the mip levels, how far to probe."""
+    """Measures each pixel's footprint: longer axis in texels, mip levels, how far to probe."""
     in_wide_vectors()
     right = steps[0, 0], steps[0, 1], steps[0, 2]
     down = steps[1, 0], steps[1, 1], steps[1, 2]
@@ -257,7 +257,7 @@ def _pair(x, size):
 
 @inlined
 def _find_levels(floats, wholes, atlas, num, coarser):
-    """Where each ray's mip level begins, and the size of its texture: looked up one by one."""
+    """Finds where each ray's mip level begins, and the size of its texture, one by one."""
     sizes, offsets = atlas
     for i in range(num):
         texture = np.uint32(wholes[TEXTURE + i])
@@ -268,7 +268,7 @@ def _find_levels(floats, wholes, atlas, num, coarser):
 
 @inlined_fused
 def _choose(floats, wholes, num, coarser, probe):
-    """The four texels round one sample of each ray, and their weights."""
+    """Chooses the four texels round one sample of each ray, and their weights."""
     in_wide_vectors()
     for i in range(num):
         width, height = wholes[_SIZE + i], wholes[_SIZE + BLOCK + i]
@@ -325,7 +325,7 @@ def _add_sample(floats, wholes, num):
 
 @inlined_fused
 def filter_block(floats, wholes, atlas, steps, num):
-    """Filtered colors in [0, 1] of the textures that a block of rays meets.
+    """Filters the textures that a block of rays meets, to colors in [0, 1].
 
     Args:
         floats: columns with directions, normals, mirrors, gradients, paths and places;
@@ -418,7 +418,7 @@ def _turn(lit, num):
 
 @inlined_fused
 def _towards(lamp, block, i):
-    """Vector from a hit to a lamp, its squared length, and its part along the normal."""
+    """Computes the vector from a hit to a lamp, its squared length, its part along the normal."""
     x = lamp[0] - block[_POSITION + i]
     y = lamp[1] - block[_POSITION + BLOCK + i]
     z = lamp[2] - block[_POSITION + 2 * BLOCK + i]
@@ -465,7 +465,7 @@ def _add_highlights(lamp, block, num):
 
 @inlined_fused
 def _light_block(lamps, ambient, block, num, colors):
-    """The module's formula for a block of surface colors, in place; sums of light begin at 0."""
+    """Lights a block of surface colors in place by the module's formula; sums begin at 0."""
     shines = False
     for i in range(num):
         shines |= block[_SPECULAR + i] > _ZERO

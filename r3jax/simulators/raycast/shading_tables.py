@@ -80,7 +80,7 @@ def build_atlas(images: list[np.ndarray]) -> TextureAtlas:
 
 
 def _level_shapes(height: int, width: int) -> list[tuple[int, int]]:
-    """Heights and widths of MAX_LEVELS levels, each half of the one before, at least 1."""
+    """Lists heights and widths of MAX_LEVELS levels, each half of the one before, at least 1."""
     return [(max(height >> k, 1), max(width >> k, 1)) for k in range(MAX_LEVELS)]
 
 

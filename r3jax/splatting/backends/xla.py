@@ -224,7 +224,7 @@ def _backward(
 def _goes_on(
     layout: Layout, batch: Batch, j: Int[Array, ""], through: Float[Array, "B P"]
 ) -> Bool[Array, ""]:
-    """Whether any tile has both Gaussians left at chunk j and a pixel that they may reach."""
+    """Checks whether any tile has Gaussians left at chunk j and a pixel that they may reach."""
     is_open = (through > TRANSMITTANCE_MIN).any(axis=1)
     return (is_open & (j * layout.chunk < batch.count)).any()
 
@@ -236,7 +236,7 @@ def _rows(
     batch: Batch,
     j: Int[Array, ""],
 ) -> tuple[Int[Array, "B G"], Float[Array, "11 B G"]]:
-    """The Gaussians in the j-th chunk of every tile, n where there are none, and `Chunk.splats`."""
+    """Gathers the Gaussians in the j-th chunk of every tile, n for none, and `Chunk.splats`."""
 
     def gather(middle: Array, ids: Array, splats: Array) -> Array:
         rows = splats.at[ids].get(mode="fill", fill_value=0.0)

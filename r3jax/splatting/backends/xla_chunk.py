@@ -42,7 +42,7 @@ class Chunk(eqx.Module):
 
 
 def stage(go: Bool[Array, ""], compute: Callable[..., Array], *args: Array) -> Array:
-    """compute(*args), into memory. A branch is what XLA does not merge with its surroundings.
+    """Computes compute(*args), into memory: XLA does not merge a branch with its surroundings.
 
     Args:
         go: true, but not known to be while compiling.
@@ -114,7 +114,7 @@ def _alpha(splats: Float[Array, "11 B G"]) -> Float[Array, "B G P"]:
 def _weight(
     alpha: Float[Array, "B G P"], products: Float[Array, "B O I P"], firsts: Float[Array, "B O P"]
 ) -> Float[Array, "B G P"]:
-    """T_i alpha_i, from the transmittance T_i (1 - alpha_i) behind the Gaussian."""
+    """Computes T_i alpha_i, from the transmittance T_i (1 - alpha_i) behind the Gaussian."""
     behind = (firsts[:, :, None] * products).reshape(alpha.shape)
     return jnp.where(behind > TRANSMITTANCE_MIN, behind * (alpha / (1.0 - alpha)), 0.0)
 

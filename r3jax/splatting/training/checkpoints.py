@@ -55,7 +55,7 @@ def settings_record(config: TrainConfig, views: Views, extent: float) -> dict[st
 
 
 def _flat(record: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings as one level, `raster.backend` for one inside another."""
+    """Flattens nested settings to one level, `raster.backend` for one inside another."""
     flat: dict[str, Any] = {}
     for name, value in record.items():
         if isinstance(value, dict):
@@ -67,7 +67,7 @@ def _flat(record: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 @contextmanager
 def only_training(folder: Path, *, is_new: bool) -> Generator[None]:
-    """Within it no other process trains in the folder.
+    """Locks the folder, so that no other process trains in it.
 
     Args:
         folder: of the checkpoints.

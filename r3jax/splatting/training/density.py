@@ -185,7 +185,7 @@ def _split(scene: GaussianScene, rows: Bool[Array, " n"], key: PRNGKeyArray) -> 
 
 
 def rotated(quats: Float[Array, "n 4"], vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """Vectors along the Gaussians' own axes, in the world."""
+    """Rotates vectors along the Gaussians' own axes into the world."""
     R = rotation_rows(quats)
     return jnp.stack([sum(R[i][j] * vectors[:, j] for j in range(3)) for i in range(3)], axis=1)
 

@@ -46,7 +46,7 @@ def initialize(
     voxel_size: float | None = None,
     key: PRNGKeyArray | None = None,
 ) -> GaussianScene:
-    """Gaussians on the surfaces that the views' depth shows.
+    """Places Gaussians on the surfaces that the views' depth shows.
 
     One Gaussian per occupied voxel, at the mean of the points in it and with their mean color;
     round, as large as the root mean square distance to its three neighbors (as Kerbl et al.
@@ -96,7 +96,7 @@ def initialize(
 
 
 def surface_points(views: Views) -> tuple[np.ndarray, np.ndarray]:
-    """Points [m, 3] float64 [m] in the world and colors [m, 3] float32 of the measured pixels.
+    """Computes points [m, 3] float64 [m] and colors [m, 3] float32 of the measured pixels.
 
     Pixels on depth edges, whose color mixes foreground and background, are left out (unless
     nothing else is there). Of very many pixels every second, third, ... row and column is used,

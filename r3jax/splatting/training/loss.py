@@ -75,7 +75,7 @@ def photometric_loss(
 def structural_similarity(
     rgb: Float[Array, "H W 3"], target: Float[Array, "H W 3"]
 ) -> Float[Array, ""]:
-    """Mean SSIM in [-1, 1] with an 11 x 11 Gaussian window, both images continued by zeros.
+    """Computes the mean SSIM in [-1, 1] with an 11 x 11 Gaussian window and zero padding.
 
     The zeros beyond the edge and the biased variances are those of the 3DGS trainer; the SSIM
     that evaluates (evaluation) follows scikit-image instead.

@@ -27,7 +27,7 @@ _LARGEST_OPACITY = 1.0 - 1e-6
 
 
 def regularization(scene: GaussianScene, config: TrainConfig) -> Float[Array, ""]:
-    """Weighted mean opacity plus weighted mean scale [m] over the rows in use (eq. 10)."""
+    """Computes weighted mean opacity plus weighted mean scale [m] of the rows in use (eq. 10)."""
     alive = scene.is_alive
     num = jnp.maximum(jnp.sum(alive), 1).astype(jnp.float32)
     opacity = jnp.sum(jnp.where(alive, jax.nn.sigmoid(scene.opacity_logits), 0.0))
@@ -120,7 +120,7 @@ def respawn(
 
 
 def _drawn(weight: Float[Array, " n"], key: PRNGKeyArray) -> Int[Array, " n"]:
-    """As many rows as there are, drawn with replacement in proportion to their weights."""
+    """Draws as many rows as there are, with replacement in proportion to their weights."""
     cumulative = jnp.cumsum(weight)
     point = jax.random.uniform(key, weight.shape) * cumulative[-1]
     row = jnp.searchsorted(cumulative, point, side="right")

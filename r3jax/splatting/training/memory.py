@@ -76,7 +76,7 @@ def free_bytes(device: Any = None) -> int | None:
 
 
 def _free_on_host(root: Path = Path("/")) -> Iterator[int]:
-    """What the machine has left, and what each control group around this process has left."""
+    """Measures the free memory of the machine, and of each control group of this process."""
     available = _number_after(root / "proc/meminfo", "MemAvailable:")
     if available is not None:
         yield available * 1024  # kB

@@ -307,7 +307,7 @@ class _Loop:
         self.is_compiled = False
 
     def _after_step(self) -> None:
-        """What the schedule wants after the step just done."""
+        """Runs what the schedule requires after the latest step."""
         run = self.run
         if run.schedule.refines_after(self.step):
             self.state, _ = refine_step(self.state, run.extent, run.config, run.schedule)
@@ -319,7 +319,7 @@ class _Loop:
             self._save()
 
     def _grow(self, growth: Growth) -> None:
-        """Other views from here on, and Gaussians for what they show."""
+        """Replaces the views, and adds Gaussians for what the new ones show."""
         if self.step < self.run.config.iterations:
             views, newborn = growth.add(self.step, self.state.scene)
             self.run = dataclasses.replace(self.run, views=views)

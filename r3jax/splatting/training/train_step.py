@@ -158,7 +158,7 @@ def train_step(
 def _gradients(
     state: TrainState, views: Views, config: TrainConfig
 ) -> tuple[Float[Array, ""], GaussianScene, DensityStatistics, _ViewReport]:
-    """Loss and gradient, means over this step's views, which are taken one after the other."""
+    """Averages loss and gradient over this step's views, which are taken one after the other."""
     num = config.views_per_step
     background = _background(config, state.step)
 

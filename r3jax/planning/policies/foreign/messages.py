@@ -75,7 +75,7 @@ def encode(message: Message) -> bytes:
 
 
 def length_of(prefix: bytes) -> int:
-    """Length of the answer that begins with these 8 bytes, they themselves included [bytes].
+    """Reads the length of the answer that begins with these 8 bytes, including them [bytes].
 
     Raises:
         MessageError: it is too long, or has arrays: most likely they are no message.

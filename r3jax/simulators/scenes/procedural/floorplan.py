@@ -162,7 +162,7 @@ class FloorPlan:
         self.model.put(pane, x, y, 0.0, inward)
 
     def build(self) -> Model:
-        """Walls, floors, ceilings, skirtings and the outer shell, with all openings cut."""
+        """Builds walls, floors, ceilings, skirtings and the outer shell, with all openings cut."""
         for room in self.rooms.values():
             self._room_surfaces(room)
         corners = np.array(
@@ -205,7 +205,7 @@ class FloorPlan:
         holes: list[_Hole],
         finish: Finish,
     ) -> None:
-        """A bar along a wall, interrupted by the openings that reach down to it."""
+        """Builds a bar along a wall, interrupted by the openings that reach down to it."""
         lo, hi = (r.x0, r.x1) if side in "ns" else (r.y0, r.y1)
         # Casings stand 0.07 m beside their opening.
         cuts = sorted((a - 0.07, b + 0.07) for a, b, c, _ in holes if c < z[1])
@@ -223,7 +223,7 @@ class FloorPlan:
             self.model.add(box((*low, z[0]), (*high, z[1])), finish)
 
     def _holes(self, r: Room, side: str) -> list[_Hole]:
-        """Openings in one wall."""
+        """Finds the openings in one wall."""
         face = {"n": r.y1, "s": r.y0, "e": r.x1, "w": r.x0}[side]
         across, along = (1, 0) if side in "ns" else (0, 1)
         lo, hi = (r.x0, r.x1) if side in "ns" else (r.y0, r.y1)

@@ -47,7 +47,7 @@ class Shape:
 
 
 def rotation(degrees: Real, axis: str = "z") -> np.ndarray:
-    """Right-handed rotation about x, y or z, [3, 3]."""
+    """Makes a right-handed rotation about x, y or z, [3, 3]."""
     c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
     i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
     matrix = np.eye(3)

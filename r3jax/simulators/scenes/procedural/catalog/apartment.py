@@ -11,7 +11,7 @@ SUMMARY = "two-bedroom apartment with living room, kitchen, bathroom and hall, 9
 
 
 def plan() -> FloorPlan:
-    """Rooms, doorways and windows."""
+    """Lays out rooms, doorways and windows."""
     drawn, white = FloorPlan(), f.enamel(f.WHITE, 3, 0.2)
     parquet, boards = f.parquet_floor(f.OAK, 14), f.plank_floor(f.WALNUT, 15, 0.25)
     ceiling = f.plaster((0.93, 0.92, 0.9), 50, 0.7)

@@ -11,7 +11,7 @@ SUMMARY = "classroom with a blackboard, a cloakroom and a store, 80 m2"
 
 
 def plan() -> FloorPlan:
-    """Rooms, doorways and windows."""
+    """Lays out rooms, doorways and windows."""
     drawn, ceiling = FloorPlan(), f.acoustic_ceiling(5)
     gray = f.enamel((0.5, 0.52, 0.5), 3, 0.2)
     speckled = f.terrazzo(

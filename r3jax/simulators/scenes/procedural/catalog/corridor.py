@@ -11,7 +11,7 @@ SUMMARY = "corridor with three offices, an archive and a lounge, 118 m2"
 
 
 def plan() -> FloorPlan:
-    """Rooms, doorways and windows."""
+    """Lays out rooms, doorways and windows."""
     drawn, ceiling = FloorPlan(), f.acoustic_ceiling(4)
     white, gray = f.enamel(f.WHITE, 3, 0.2), f.carpet((0.45, 0.4, 0.37), (0.62, 0.56, 0.5), 10)
     green = f.enamel((0.42, 0.5, 0.42), 6, 0.25)

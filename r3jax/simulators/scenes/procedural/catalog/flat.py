@@ -11,7 +11,7 @@ SUMMARY = "one-room flat with kitchenette, hall and bathroom, 34 m2"
 
 
 def plan() -> FloorPlan:
-    """Rooms, doorways and windows."""
+    """Lays out rooms, doorways and windows."""
     drawn, white, oak = FloorPlan(), f.enamel(f.WHITE, 3, 0.2), f.plank_floor(f.OAK, 4)
     ceiling = f.plaster((0.93, 0.92, 0.9), 50, 0.7)
     drawn.room(

@@ -11,7 +11,7 @@ SUMMARY = "gallery of three halls with pictures, sculptures and a wall mirror, 8
 
 
 def plan() -> FloorPlan:
-    """Rooms, doorways and windows."""
+    """Lays out rooms, doorways and windows."""
     drawn = FloorPlan()
     gilt, damask = f.enamel((0.62, 0.5, 0.28), 3, 0.5), ((0.5, 0.19, 0.18), (0.56, 0.25, 0.2))
     drawn.room(

@@ -11,7 +11,7 @@ SUMMARY = "kitchen-diner with an island, marble worktops and a pantry, 32 m2"
 
 
 def plan() -> FloorPlan:
-    """Rooms, doorways and windows."""
+    """Lays out rooms, doorways and windows."""
     drawn, ceiling = FloorPlan(), f.plaster((0.93, 0.92, 0.9), 50, 0.7)
     lines = ((0.8, 0.78, 0.72), (0.5, 0.6, 0.5))
     drawn.room(

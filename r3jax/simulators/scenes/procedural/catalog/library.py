@@ -11,7 +11,7 @@ SUMMARY = "library with a reading hall, a study and a foyer, 98 m2"
 
 
 def plan() -> FloorPlan:
-    """Rooms, doorways and windows."""
+    """Lays out rooms, doorways and windows."""
     drawn, dark = FloorPlan(), f.enamel((0.3, 0.21, 0.15), 3, 0.3)
     ceiling = f.plaster((0.92, 0.9, 0.85), 111)
     drawn.room(

@@ -21,7 +21,7 @@ SUMMARY = "brick loft with columns and beams, bathroom and dressing room, 72 m2"
 
 
 def plan() -> FloorPlan:
-    """Rooms, doorways and windows."""
+    """Lays out rooms, doorways and windows."""
     drawn, brick = FloorPlan(), f.brick(7)
     floor = f.concrete((0.62, 0.6, 0.57), 31)
     drawn.room(

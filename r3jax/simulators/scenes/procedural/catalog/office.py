@@ -18,7 +18,7 @@ SUMMARY = "open-plan office with glass partitions, meeting room, break room and 
 
 
 def plan() -> FloorPlan:
-    """Rooms, doorways and windows."""
+    """Lays out rooms, doorways and windows."""
     drawn, ceiling = FloorPlan(), f.acoustic_ceiling(3)
     gray = f.carpet((0.4, 0.43, 0.47), (0.58, 0.6, 0.6), 5)
     skirting = f.enamel(f.CHARCOAL, 2, 0.2)
@@ -58,7 +58,7 @@ def plan() -> FloorPlan:
 
 
 def _meeting_room(m: Model) -> None:
-    """Glass walls round x = 0 .. 4.2, y = 3.7 .. 6.8, open between x = 2.9 and 4.2."""
+    """Builds glass walls round x = 0 .. 4.2, y = 3.7 .. 6.8, open between x = 2.9 and 4.2."""
     m.put(workplace.glass_partition(2.9, 2.8), 1.45, 3.7)
     m.put(workplace.glass_partition(3.06, 2.8), 4.24, 5.27, 0, 90.0)
     m.put(workplace.meeting_table(1.8, 0.9, 3, 1), 1.7, 5.2)

@@ -124,7 +124,7 @@ def wall_shelf(width: Real, z: Real, things: list[Model]) -> Model:
 
 
 def coat_rack(seed: int) -> Model:
-    """Hooks on a board with two coats and a scarf."""
+    """Builds hooks on a board with two coats and a scarf."""
     model = Model().add(box((-0.5, 0, 1.62), (0.5, 0.025, 1.74)), f.wood(f.WALNUT, 3))
     cloths = (
         f.fabric(f.NAVY, 2),

@@ -21,7 +21,7 @@ from r3jax.simulators.scenes.procedural.shapes import (
 
 
 def _front(model: Model, x0: Real, x1: Real, z0: Real, z1: Real, y: Real, finish: Finish) -> None:
-    """A cupboard door or drawer front with a frame and a bar handle."""
+    """Builds a cupboard door or drawer front with a frame and a bar handle."""
     model.add(box((x0 + 0.003, y, z0 + 0.003), (x1 - 0.003, y + 0.018, z1 - 0.003)), finish)
     t = 0.06
     if z1 - z0 > 0.3:
@@ -180,7 +180,7 @@ def island(width: Real, front: Finish, top: Finish, seed: int) -> Model:
 
 
 def kitchen_shelf(seed: int, width: Real = 1.2) -> list[Model]:
-    """Packages, jars and bottles for a wall shelf."""
+    """Builds packages, jars and bottles for a wall shelf."""
     makers = (objects.jar, objects.carton, objects.bottle)
     return [makers[k % 3](seed + k) for k in range(round(width / 0.13))]
 

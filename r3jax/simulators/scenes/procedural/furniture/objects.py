@@ -34,7 +34,7 @@ def _on_spine(shape: Shape, spine: int, low: Real = 0.02, high: Real = 0.98) -> 
 
 
 def book_row(length: Real, height: Real, depth: Real, seed: int, thickness: Real = 1.0) -> Model:
-    """Books side by side with a few gaps and leaners, spines towards +y.
+    """Builds books side by side with a few gaps and leaners, spines towards +y.
 
     Spans x = 0 .. length, y = 0 .. depth; no book is taller than `height`. Books are 1.8 to 5.6 cm
     thick, times `thickness`.

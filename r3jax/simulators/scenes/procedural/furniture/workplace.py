@@ -56,7 +56,7 @@ def workstation(seed: int, width: Real = 1.5) -> Model:
 
 
 def desk_island(pairs: int, seed: int) -> Model:
-    """Workstations face to face with a pinboard screen between; origin in the middle."""
+    """Builds workstations face to face with a pinboard screen between; origin in the middle."""
     model, length = Model(), pairs * 1.5
     for k in range(pairs):
         x = (k + 0.5) * 1.5 - length / 2

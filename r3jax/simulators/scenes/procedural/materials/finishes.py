@@ -38,13 +38,13 @@ WHITE, CREAM, CHARCOAL, SAGE, NAVY, TERRACOTTA, MUSTARD, BLUSH, TEAL = (
 
 @functools.cache
 def plaster(color: Color, seed: int, strength: Real = 1.0) -> Finish:
-    """Painted plaster on walls and ceilings."""
+    """Makes the finish of painted plaster on walls and ceilings."""
     return Finish(Material(textures.plaster(color, seed, strength)), (2.4, 2.4))
 
 
 @functools.cache
 def wallpaper(ground: Color, inks: tuple[Color, ...], motif: str, seed: int) -> Finish:
-    """Printed wallpaper."""
+    """Makes the finish of printed wallpaper."""
     return Finish(Material(patterns.wallpaper(ground, inks, motif, seed)), (1.9, 1.9))
 
 
@@ -68,7 +68,7 @@ def acoustic_ceiling(seed: int) -> Finish:
 
 @functools.cache
 def wood(color: Color, seed: int = 0, gloss: Real = 0.15) -> Finish:
-    """Oiled or lacquered furniture wood."""
+    """Makes the finish of oiled or lacquered furniture wood."""
     material = Material(textures.wood(color, seed), specular=gloss, shininess=24.0)
     return Finish(material, (1.1, 0.8))
 
@@ -84,7 +84,7 @@ def plank_floor(color: Color, seed: int, gloss: Real = 0.2, rows: int = 14) -> F
 
 @functools.cache
 def parquet_floor(color: Color, seed: int, gloss: Real = 0.3) -> Finish:
-    """Basket-weave parquet."""
+    """Makes the finish of basket-weave parquet."""
     material = Material(
         textures.parquet(color, seed), specular=gloss, shininess=48.0, mirror=0.25 * gloss
     )
@@ -101,7 +101,7 @@ def tiled(
     bond: Real = 0.0,
     mirror: Real = 0.05,
 ) -> Finish:
-    """Glazed tiles; `edge` is the height of one [m], the width follows from the counts."""
+    """Makes the finish of glazed tiles; `edge` is the height of one [m], the width follows."""
     texture = textures.tiles(colors, seed, columns, rows, bond=bond)
     width = edge * rows
     return Finish(Material(texture, specular=0.45, shininess=60.0, mirror=mirror), (width, width))
@@ -109,21 +109,21 @@ def tiled(
 
 @functools.cache
 def marble(color: Color, vein: Color, seed: int, mirror: Real = 0.08) -> Finish:
-    """Polished stone."""
+    """Makes the finish of polished stone."""
     texture = textures.marble(color, vein, seed)
     return Finish(Material(texture, specular=0.5, shininess=80.0, mirror=mirror), (1.8, 1.8))
 
 
 @functools.cache
 def terrazzo(color: Color, chips: tuple[Color, ...], seed: int) -> Finish:
-    """Polished terrazzo."""
+    """Makes the finish of polished terrazzo."""
     texture = textures.terrazzo(color, chips, seed)
     return Finish(Material(texture, specular=0.4, shininess=64.0, mirror=0.08), (1.8, 1.8))
 
 
 @functools.cache
 def metal(color: Color = (0.68, 0.69, 0.7), seed: int = 0, mirror: Real = 0.15) -> Finish:
-    """Brushed metal."""
+    """Makes the finish of brushed metal."""
     texture = textures.metal(color, seed)
     return Finish(Material(texture, specular=0.7, shininess=50.0, mirror=mirror), (0.9, 0.9))
 
@@ -145,7 +145,7 @@ def fabric(color: Color, seed: int = 0) -> Finish:
 
 @functools.cache
 def striped(colors: tuple[Color, ...], seed: int = 0, repeats: int = 4) -> Finish:
-    """Striped cloth."""
+    """Makes the finish of striped cloth."""
     return Finish(Material(patterns.stripes(colors, seed, repeats)), (0.9, 0.9))
 
 
@@ -157,7 +157,7 @@ def plaid(ground: Color, first: Color, second: Color, seed: int = 0) -> Finish:
 
 @functools.cache
 def printed(ground: Color, inks: tuple[Color, ...], motif: str, seed: int) -> Finish:
-    """Printed cloth for curtains and cushions."""
+    """Makes the finish of printed cloth for curtains and cushions."""
     return Finish(Material(patterns.wallpaper(ground, inks, motif, seed, 512)), (0.9, 0.9))
 
 
@@ -169,7 +169,7 @@ def leather(color: Color, seed: int = 0) -> Finish:
 
 @functools.cache
 def carpet(color: Color, fleck: Color, seed: int = 0) -> Finish:
-    """Fitted carpet."""
+    """Makes the finish of fitted carpet."""
     return Finish(Material(patterns.carpet(color, fleck, seed)), (2.0, 2.0))
 
 
@@ -218,7 +218,7 @@ def glass(color: Color = (0.62, 0.74, 0.72), seed: int = 5) -> Finish:
 
 @functools.cache
 def frosted(seed: int = 6) -> Finish:
-    """Glass with an etched pattern: depth sensors do see it."""
+    """Makes the finish of glass with an etched pattern: depth sensors do see it."""
     etched = ((0.9, 0.94, 0.94), (0.58, 0.69, 0.69))
     texture = patterns.wallpaper((0.74, 0.82, 0.82), etched, "trellis", seed, 512)
     return Finish(Material(texture, specular=0.4, shininess=60.0, mirror=0.08), (0.9, 0.9))

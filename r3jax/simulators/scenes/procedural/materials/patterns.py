@@ -72,7 +72,7 @@ def plaid(ground: Color, first: Color, second: Color, seed: int, size: int = 512
 
 @functools.cache
 def carpet(color: Color, fleck: Color, seed: int, size: int = 768) -> np.ndarray:
-    """Cut-pile carpet with flecks."""
+    """Paints cut-pile carpet with flecks."""
     pile = cloud(size, size, seed, 0.35, 1.0, 20.0)
     trodden = cloud(size, size, seed + 1, 1.6)
     weight = 0.55 * smoothstep(0.6, 1.6, cloud(size, size, seed + 2, 0.6, 1.0, 16.0))
@@ -123,7 +123,7 @@ def _leaf(draw: ImageDraw.ImageDraw, at: np.ndarray, angle: Real, length: Real, 
 def _sprig(
     draw: ImageDraw.ImageDraw, at: np.ndarray, size: Real, rng: np.random.Generator, inks: list[Ink]
 ) -> None:
-    """A branch with leaves on both sides and a flower on top."""
+    """Paints a branch with leaves on both sides and a flower on top."""
     lean = rng.normal(0.0, 0.35) - np.pi / 2
     tip = at + size * np.array([np.cos(lean), np.sin(lean)])
     draw.line([tuple(at), tuple(tip)], fill=inks[0], width=max(2, int(size / 40)))
@@ -139,7 +139,7 @@ def _sprig(
 def wallpaper(
     ground: Color, inks: tuple[Color, ...], motif: str, seed: int, size: int = 768
 ) -> np.ndarray:
-    """Printed wallpaper on textured paper.
+    """Paints printed wallpaper on textured paper.
 
     Args:
         ground: color of the paper.
@@ -223,7 +223,7 @@ def _lines(
 
 @functools.cache
 def leather(color: Color, seed: int, size: int = 512) -> np.ndarray:
-    """Grained leather with creases and worn places."""
+    """Paints grained leather with creases and worn places."""
     creases = np.exp(-np.abs(cloud(size, size, seed, 0.9, 1.0, 10.0)) * 9.0)
     worn = cloud(size, size, seed + 1, 1.7)
     shade = 1.04 - 0.22 * creases + 0.08 * worn + 0.03 * cloud(size, size, seed + 2, 0.4)

@@ -114,7 +114,7 @@ def _rgb(color: Color) -> np.ndarray:
 
 @functools.cache
 def plaster(color: Color, seed: int, strength: Real = 1.0, size: int = 768) -> np.ndarray:
-    """Painted plaster: roller grain, trowel strokes, faint stains."""
+    """Paints painted plaster: roller grain, trowel strokes, faint stains."""
     broad = cloud(size, size, seed, 1.9)
     strokes = cloud(size, size, seed + 1, 1.1, 3.0, 8.0)
     grain = cloud(size, size, seed + 2, 0.5, 1.0, 60.0)
@@ -187,7 +187,7 @@ def planks(
 
 @functools.cache
 def parquet(color: Color, seed: int, blocks: int = 6, size: int = 768) -> np.ndarray:
-    """Basket-weave parquet: square blocks of five staves, turned by turns."""
+    """Paints basket-weave parquet: square blocks of five staves, turned by turns."""
     rng = np.random.default_rng(seed)
     base = _grain(color, seed, size, size, 15.0)
     image = np.empty_like(base)
@@ -217,7 +217,7 @@ def tiles(
     bond: Real = 0.0,
     size: int = 768,
 ) -> np.ndarray:
-    """Glazed tiles with grout. `bond` shifts every other row by that share of a tile."""
+    """Paints glazed tiles with grout. `bond` shifts every other row by that share of a tile."""
     rng = np.random.default_rng(seed)
     row, column = np.mgrid[0:size, 0:size].astype(np.float32) / size
     i = np.floor(row * rows).astype(int)
@@ -254,7 +254,7 @@ def brick(seed: int, color: Color = (0.62, 0.33, 0.25), size: int = 768) -> np.n
 
 @functools.cache
 def marble(color: Color, vein: Color, seed: int, size: int = 768) -> np.ndarray:
-    """Polished marble: thin veins of two scales on cloudy stone."""
+    """Paints polished marble: thin veins of two scales on cloudy stone."""
     broad = cloud(size, size, seed, 1.9)
     thick = np.exp(-np.abs(cloud(size, size, seed + 1, 1.7)) * 14.0)
     thin = np.exp(-np.abs(cloud(size, size, seed + 2, 1.45, 1.0, 3.0)) * 18.0)
@@ -284,7 +284,7 @@ def terrazzo(color: Color, chips: tuple[Color, ...], seed: int, size: int = 768)
 
 @functools.cache
 def metal(color: Color, seed: int, size: int = 384) -> np.ndarray:
-    """Brushed metal with smudges."""
+    """Paints brushed metal with smudges."""
     brushed = cloud(size, size, seed, 0.5, 40.0)
     smudge = cloud(size, size, seed + 1, 1.7)
     shade = 1.0 + 0.06 * brushed + 0.05 * smudge
@@ -302,7 +302,7 @@ def enamel(color: Color, seed: int, size: int = 384) -> np.ndarray:
 
 @functools.cache
 def acoustic(seed: int, size: int = 768) -> np.ndarray:
-    """Suspended ceiling of perforated mineral tiles (4 x 4 to the texture)."""
+    """Paints a suspended ceiling of perforated mineral tiles (4 x 4 to the texture)."""
     row, column = np.mgrid[0:size, 0:size].astype(np.float32) / size * 4.0
     edge = np.minimum(
         np.minimum(row % 1.0, 1.0 - row % 1.0), np.minimum(column % 1.0, 1.0 - column % 1.0)
