@@ -257,7 +257,7 @@ def _reach(source: Source, frame: Frame) -> Float[Array, ""]:
 
 
 def blank(state: MapState) -> MapState:
-    """Returns the same rows, of which nothing has been seen."""
+    """Returns a map with the same rows, without observations."""
     empty = jax.tree.map(jnp.zeros_like, state)
     kept = lambda m: (m.key, m.voxel_size)
     return eqx.tree_at(kept, empty, kept(state))

@@ -141,7 +141,7 @@ def choose(
 
 
 def _best(bound: np.ndarray, is_new: np.ndarray, objective: Objective, ranks: np.ndarray) -> int:
-    """Returns the frame with the largest gain; among equals the one of the lowest rank."""
+    """Finds the frame with the largest gain; among equals the one of the lowest rank."""
     while True:
         best = renew_best(bound, is_new, objective.gains, _AT_ONCE)
         assert best is not None  # no more are chosen than may be
@@ -153,7 +153,7 @@ def _best(bound: np.ndarray, is_new: np.ndarray, objective: Objective, ranks: np
 
 
 def _after(observed: Observed, targets: Targets, frames: np.ndarray) -> np.ndarray:
-    """Returns renderability of each target on the map of some frames, [T]."""
+    """Computes the renderability of each target on the map of some frames, [T]."""
     objective = Objective(observed, targets)
     for frame in frames.tolist():
         objective.add(frame)
@@ -161,7 +161,7 @@ def _after(observed: Observed, targets: Targets, frames: np.ndarray) -> np.ndarr
 
 
 def component_of(observed: Observed) -> np.ndarray:
-    """Returns the scene of each frame, [n]: frames that a chain of common surfaces connects."""
+    """Labels the scene of each frame, [n]: frames that a chain of common surfaces connects."""
     frame, row = observed.frame[observed.is_colored], observed.row[observed.is_colored]
     size = len(observed) + observed.num_rows
     links = (np.ones(len(frame), dtype=bool), (frame, len(observed) + row))
@@ -185,7 +185,7 @@ def in_proportion(sizes: np.ndarray, num: int) -> np.ndarray:
 
 
 class _Quotas:
-    """How many frames of each scene may still be chosen."""
+    """Number of frames of each scene that may still be chosen."""
 
     def __init__(self, component: np.ndarray, allowed: np.ndarray, num: int):
         self._component = component
@@ -197,5 +197,5 @@ class _Quotas:
         self._left[self._component[frame]] -= 1
 
     def full(self) -> np.ndarray:
-        """Returns frames that may not be chosen, since their scene has its share."""
+        """Returns the frames that may not be chosen, since their scene has its share."""
         return np.flatnonzero(self._left[self._component] <= 0)

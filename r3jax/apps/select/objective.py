@@ -102,7 +102,7 @@ class Objective:
         )
 
     def _changed(self, frame: int) -> "_Changed":
-        """Returns rows and pairs that a frame changes, with their values and gains."""
+        """Computes the rows and pairs that a frame changes, with their values and gains."""
         seen, to = self._observed, self._targets
         part = slice(int(seen.first[frame]), int(seen.first[frame + 1]))
         rows, colored = seen.row[part], seen.is_colored[part]
@@ -149,7 +149,7 @@ class _Changed(NamedTuple):
 
 
 def _sides(q: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """Returns a bit for each side of the tangent axes at r on which q lies, [P]."""
+    """Computes a bit for each side of the tangent axes at r on which q lies, [P]."""
     x, y, z = r.T
     is_pole = x * x + y * y < 1e-12
     a_x, a_y = np.where(is_pole, 1.0, -y), np.where(is_pole, 0.0, x)
@@ -166,7 +166,7 @@ def _consistency(count: np.ndarray, m2: np.ndarray) -> np.ndarray:
 def _value(
     cosine: np.ndarray, is_inside: np.ndarray, delta: np.ndarray, ratio: np.ndarray
 ) -> np.ndarray:
-    """Returns R of pairs (`scoring.terms`)."""
+    """Computes R of pairs (`scoring.terms`)."""
     kappa = np.where(is_inside, 1.0, 2.0)
     bias = cosine**kappa
     return bias * delta ** (kappa * (1.0 - bias)) * ratio ** (1.0 - delta * bias)
@@ -188,6 +188,6 @@ def renderability_of(observed: Observed, targets: Targets, frames: Sequence[int]
 def _values(
     state: MapState, position: Float[Array, "T 3"], focal: Float[Array, " T"]
 ) -> Float[Array, "T N"]:
-    """Returns R of every row from every target."""
+    """Computes R of every row from every target."""
     score = lambda position, focal: score_voxels(state, position, focal).value
     return jax.lax.map(lambda pair: score(*pair), (position, focal))

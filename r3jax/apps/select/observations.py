@@ -57,7 +57,7 @@ class Observed:
     """False where no pixel fell into the voxel, which was seen anyway, [m]."""
 
     def __len__(self) -> int:
-        """Returns number of frames."""
+        """Returns the number of frames."""
         return len(self.first) - 1
 
     @property
@@ -77,7 +77,7 @@ class Observed:
         return np.repeat(np.arange(len(self)), np.diff(self.first))
 
     def map_of(self, frames: Sequence[int]) -> MapState:
-        """Returns the map of just some frames, on all rows: by the rules that merge maps."""
+        """Merges the maps of some frames, on all rows."""
         num, words = self.num_rows, -(-self.num_bins // 32)
         moments = (jnp.zeros(num), jnp.zeros((3, num)), jnp.zeros(num))
         visited, best = np.zeros((words, num), np.uint32), np.zeros(num, np.float32)
@@ -111,7 +111,7 @@ _combined = jax.jit(combine_moments)
 def map_frames(
     frames: Iterable[Frame], voxel_size: float, *, max_range: float = RANGE, drop_edges: bool = True
 ) -> MapState:
-    """Returns the map of all surfaces.
+    """Builds the map of all surfaces.
 
     Args:
         frames: one by one.
@@ -159,13 +159,13 @@ def observe(
 
 
 def ordered_rows(whole: MapState) -> np.ndarray:
-    """Returns rows of a map that hold voxels, in the order of their keys, [N]."""
+    """Finds the rows of a map that hold voxels, in the order of their keys, [N]."""
     occupied = np.flatnonzero(np.asarray(whole.occupied))
     return occupied[np.lexsort(np.asarray(whole.key)[:, occupied])]
 
 
 def _part(seen: MapState, row_of: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Returns what one frame alone has left in a map, in the order of the rows."""
+    """Reads the observations of a single frame from its map, in the order of the rows."""
     visited, count = np.asarray(seen.visited), np.asarray(seen.count)
     at = np.flatnonzero(visited.any(axis=0))
     at = at[np.argsort(row_of[at], kind="stable")]

@@ -114,7 +114,7 @@ class _Files:
         self.written: list[str] = []
 
     def path(self, name: str) -> Path:
-        """Returns where a file is to be written."""
+        """Returns the path of a file to write, and makes its folder."""
         path = below(self.folder, name)
         make_folder(path.parent)
         if name not in self.written:
@@ -303,7 +303,7 @@ def _depth(source: Run | PosedImages, index: int) -> np.ndarray | None:
 
 
 def _depth_png(depth: np.ndarray) -> bytes:
-    """Returns a PNG of depth in millimeters; 0 where none is known."""
+    """Encodes depth in millimeters as PNG; 0 where none is known."""
     known = np.where(np.isfinite(depth) & (depth < _LARGEST_DEPTH), depth, 0.0)
     buffer = io.BytesIO()
     Image.fromarray(np.rint(1000.0 * known).astype(np.uint16)).save(buffer, format="png")
@@ -311,7 +311,7 @@ def _depth_png(depth: np.ndarray) -> bytes:
 
 
 def _lens_fields(lens: Lens) -> dict[str, Any]:
-    """Returns a camera in nerfstudio's words."""
+    """Describes a camera by nerfstudio's fields."""
     fx, fy, cx, cy = lens.intrinsics
     pinhole = pinhole_lens(lens.camera)
     is_fisheye = "FISHEYE" in lens.model
@@ -352,7 +352,7 @@ def record_of(found: Selected) -> dict[str, Any]:
 
 
 def _unique(labels: Sequence[str]) -> list[str]:
-    """Returns labels of frames, with their numbers where pictures of folders share names."""
+    """Labels frames, with their numbers where pictures of folders share names."""
     if len(set(labels)) == len(labels):
         return list(labels)
     return [f"{number:05d} {label}" for number, label in enumerate(labels)]

@@ -84,7 +84,7 @@ def unknown_quality(observed: Observed) -> Quality:
 
 
 def with_quality(observed: Observed, blur: np.ndarray, exposure: np.ndarray) -> Observed:
-    """Returns the same observations as blurred frames give them, and without their exposure.
+    """Applies the frames' blur to their observations, and removes their exposure.
 
     Args:
         observed: what the frames show.

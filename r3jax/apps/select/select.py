@@ -80,7 +80,7 @@ class Selected:
     """Why frames were dropped, a few words, by their numbers in the capture."""
 
     notes: tuple[str, ...] = field(default=())
-    """Returns what the user should know, sentences."""
+    """Notes for the user, in sentences."""
 
     @property
     def kept(self) -> np.ndarray:
@@ -168,7 +168,7 @@ def select(
 def _surfaces(
     source: Source, survey: Survey, on_frame: Callable[[], None]
 ) -> tuple[MapState, list[BlockImage], dict[int, FormatError]]:
-    """Returns the map of all frames, their pictures in blocks, and unreadable frames."""
+    """Maps all frames; returns also their pictures in blocks, and unreadable frames."""
     images: list[BlockImage] = []
     unread: dict[int, FormatError] = {}
 
@@ -188,7 +188,7 @@ def _surfaces(
 
 
 def _named(source: Source, used: np.ndarray, names: Sequence[str]) -> list[int]:
-    """Returns numbers among `used` of the frames with some names, with or without their suffix."""
+    """Finds the numbers among `used` of frames by name, with or without their suffix."""
     found: list[int] = []
     for name in names:
         fits = [i for i, index in enumerate(used) if _is_named(source.labels[index], name)]
@@ -213,7 +213,7 @@ def _allowed(
     used: np.ndarray,
     keep: Sequence[int],
 ) -> tuple[np.ndarray, dict[int, str]]:
-    """Returns frames that may be chosen, [n], and why the others may not.
+    """Returns a mask of the frames that may be chosen, [n], and why the others may not.
 
     Raises:
         ValueError: none may be.
@@ -284,7 +284,7 @@ def _targets(
 
 
 def _reasons(found: Selected, known: dict[int, str]) -> dict[int, str]:
-    """Returns why the frames that were not chosen were not, by their numbers in the capture."""
+    """Explains why each frame was not chosen, by its number in the capture."""
     source, used, quality = found.source, found.used, found.quality
     order = found.choice.order
     total = max(float(found.choice.of_all.mean()), 1e-9)
@@ -306,7 +306,7 @@ def _reasons(found: Selected, known: dict[int, str]) -> dict[int, str]:
 
 
 def _twin(found: Selected, frame: int) -> int | None:
-    """Returns the chosen frame that shows nearly the same; None: there is none."""
+    """Finds a chosen frame that shows nearly the same, or None."""
     poses = found.source.poses[found.used]
     order = found.choice.order
     near, turned = _TWIN

@@ -75,7 +75,7 @@ def write_page(found: Selected, folder: Path, written: Written) -> Path:
 
 
 def lead(found: Selected) -> list[str]:
-    """Returns what was found, in a sentence."""
+    """Summarizes the selection in a sentence."""
     kept, total = len(found.choice.order), len(found.used)
     share = 100.0 * float(found.choice.share[-1])
     sentence = (
@@ -86,7 +86,7 @@ def lead(found: Selected) -> list[str]:
 
 
 def commands(written: Written) -> list[str]:
-    """Returns commands that train on the data set."""
+    """Writes commands that train on the data set."""
     folder = written.record.parent
     if written.data_set.suffix == ".json":
         return [
@@ -115,7 +115,7 @@ def _cards(found: Selected) -> dict[str, str]:
 
 
 def knee(found: Selected) -> int | None:
-    """Returns number of frames that give 95 % of what all give; None: more than are kept."""
+    """Returns the number of frames that give 95 % of what all give; None if more than are kept."""
     reached = np.flatnonzero(found.choice.share >= _KNEE)
     return int(reached[0]) + 1 if len(reached) else None
 
@@ -128,7 +128,7 @@ def _curve_note(found: Selected) -> str:
 
 
 def _curve(found: Selected) -> Figure:
-    """Returns the objective over the number of frames, with its knee and what all frames give."""
+    """Draws the objective over the number of frames, with its knee and what all frames give."""
     choice = found.choice
     figure = style.new_figure(10.0, 3.6)
     axes = style.dress(figure.subplots(), x="frames kept", y="mean renderability of the targets")
@@ -153,7 +153,7 @@ def _curve(found: Selected) -> Figure:
 
 
 def _plan(found: Selected) -> Figure:
-    """Returns voxels from above, and all cameras."""
+    """Draws voxels from above, and all cameras."""
     alignment, used = found.survey.alignment, found.used
     poses = alignment.poses(found.source.poses[used])
     places, ahead = poses[:, :2, 3], poses[:, :2, 2]
@@ -189,7 +189,7 @@ def _plan(found: Selected) -> Figure:
 def _from_above(
     found: Selected, height: float
 ) -> tuple[np.ndarray, tuple[float, float, float, float]]:
-    """Returns colors of the highest voxels below the cameras' heads, pale; and their extent."""
+    """Returns the colors of the highest voxels below the cameras' heads, pale; and their extent."""
     state = found.whole
     there = np.asarray(state.occupied)
     center = np.asarray(state.center).T[there]
@@ -240,7 +240,7 @@ def _thumbnail(found: Selected, index: int, reason: str) -> dict[str, Any]:
 
 
 def _method(found: Selected) -> list[str]:
-    """Returns how this was computed, sentences."""
+    """Explains how the selection was computed, in sentences."""
     settings = found.settings
     targets = {
         FRAMES: f"the capture's own {found.targets} frames",

@@ -77,7 +77,7 @@ class SelectSettings(SurveySettings):
         return self.gain
 
     def number(self, count: int) -> int:
-        """Returns frames to keep of `count`, at most."""
+        """Returns how many of `count` frames to keep at most."""
         if self.frames is not None:
             return min(self.frames, count)
         return count if self.share is None else max(1, round(self.share * count))

@@ -46,7 +46,7 @@ class Targets:
     """Share of the target's pixels that show the row, [P] float32; the rest is not known."""
 
     def __len__(self) -> int:
-        """Returns number of targets."""
+        """Returns the number of targets."""
         return len(self.focal)
 
     @property

@@ -56,7 +56,7 @@ def small_gray(rgb: np.ndarray) -> np.ndarray:
 
 
 def shift_between(first: np.ndarray, second: np.ndarray) -> float:
-    """Returns how far an image [h, w] moved, as a share of its width, by phase correlation."""
+    """Estimates the motion of an image [h, w] as a share of its width, by phase correlation."""
     window = np.outer(np.hanning(first.shape[0]), np.hanning(first.shape[1]))
     spectra = [np.fft.rfft2((image - image.mean()) * window) for image in (first, second)]
     cross = spectra[0] * np.conj(spectra[1])
