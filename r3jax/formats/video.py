@@ -17,7 +17,7 @@ SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 
 
 def is_video(path: Path) -> bool:
-    """Returns true for a file that is called a video."""
+    """Returns True for a file whose name is that of a video."""
     return path.is_file() and path.suffix.lower() in SUFFIXES
 
 

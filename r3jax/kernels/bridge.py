@@ -84,7 +84,7 @@ def _image(frame, first):
 
 @inlined
 def _tables(frame, first):
-    """Directions of a voxel's bins, then candidates and directions of the panorama's bins."""
+    """Views directions of a voxel's bins, then candidates and directions of the panorama's."""
     return Tables(
         floats2(frame, ARGUMENTS, first), ints2(frame, ARGUMENTS, first + 1),
         floats2(frame, ARGUMENTS, first + 2),
@@ -236,7 +236,7 @@ def _changes(frame):
 
 @inlined
 def _cloud(frame, kind):
-    """`calls.Cloud`, the first six arrays."""
+    """Views the first six arrays as `calls.Cloud`."""
     return (
         floats2(frame, kind, 0), floats2(frame, kind, 1), floats2(frame, kind, 2),
         floats1(frame, kind, 3), floats2(frame, kind, 4), floats2(frame, kind, 5),
@@ -245,7 +245,7 @@ def _cloud(frame, kind):
 
 @inlined
 def _images(frame, kind, first):
-    """`calls.Images`."""
+    """Views three arrays as `calls.Images`."""
     return (
         floats3(frame, kind, first), floats2(frame, kind, first + 1),
         floats2(frame, kind, first + 2),
@@ -254,7 +254,7 @@ def _images(frame, kind, first):
 
 @inlined
 def _lists(frame, kind, first):
-    """`calls.Drawn` but for the records."""
+    """Views the arrays of `calls.Drawn`, except for the records."""
     return (
         ints1(frame, kind, first), ints1(frame, kind, first + 1), bytes1(frame, kind, first + 2),
         ints1(frame, kind, first + 3), ints1(frame, kind, first + 4),
@@ -340,7 +340,7 @@ def _image_loss(frame):
 
 @inlined
 def _scene(frame, kind, first):
-    """The five arrays of a scene, each flat."""
+    """Views the five arrays of a scene, each flat."""
     return (
         floats_flat(frame, kind, first), floats_flat(frame, kind, first + 1),
         floats_flat(frame, kind, first + 2), floats_flat(frame, kind, first + 3),

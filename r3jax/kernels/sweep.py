@@ -214,7 +214,7 @@ def plane_scores(reference, sources, sizes, A, b, inverses, radius):
 
 @inlined_fast
 def _step(scores, before, after, total, small, large):
-    """One pixel's step of the recursion of `smooth_scores`.
+    """Takes one pixel's step of the recursion of `smooth_scores`.
 
     Args:
         scores: of the pixel, [p].

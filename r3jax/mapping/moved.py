@@ -76,7 +76,7 @@ def _nearest_around(
     column: Int[Array, " N"],
     half: Int[Array, " N"],
 ) -> Float[Array, " N"]:
-    """Least depth in a square of 2 half + 1 pixels; 0 where it leaves the image or is too large."""
+    """Finds the least depth in a square of 2 half + 1 pixels; 0 if too large or off the image."""
     height, width = depth.shape
     is_in = (half <= constants.MOST_HALF) & (row >= half) & (column >= half)
     is_in &= (row + half < height) & (column + half < width)

@@ -68,7 +68,7 @@ def rebuild(
 
 
 def _read_ahead(frames: Iterable[Frame]) -> Iterator[Frame]:
-    """The same frames, each read in a thread while the one before it is used."""
+    """Yields the same frames, each read in a thread while the one before it is used."""
     frames = iter(frames)
     with ThreadPoolExecutor(1, thread_name_prefix="frames") as reader:
         coming = reader.submit(next, frames, _END)

@@ -90,7 +90,7 @@ def read_stray_scanner(path: Path | str) -> PosedImages:
 
 
 def _shot(archive: Archive, video: Video, row: np.ndarray, params: np.ndarray) -> Shot:
-    """Returns one frame of a row [8] of the table and its intrinsics [4]."""
+    """Makes one frame of a row [8] of the table and its intrinsics [4]."""
     number = int(row[0])
     if number != row[0] or number < 0:
         raise ForeignFileError(f"{row[0]:g} is no number of a frame")
@@ -105,7 +105,7 @@ def _shot(archive: Archive, video: Video, row: np.ndarray, params: np.ndarray) -
 
 
 def _video(archive: Archive) -> Video:
-    """Returns the video, from the disk where it lies there."""
+    """Opens the video, from the disk if it lies there."""
     name = archive.where(_VIDEO)
     if archive.zipped is not None:
         return Video(name, archive.read(_VIDEO, _MAX_VIDEO))
@@ -115,7 +115,7 @@ def _video(archive: Archive) -> Video:
 
 
 def _table(archive: Archive) -> tuple[np.ndarray, np.ndarray]:
-    """The columns of odometry.csv: frame and pose [n, 8], and intrinsics [n, 4]; NaN: not known.
+    """Reads odometry.csv: frame and pose [n, 8], and intrinsics [n, 4]; unknown values are NaN.
 
     Raises:
         ForeignFileError: no such columns, no rows, or a field that is no number.
@@ -139,7 +139,7 @@ def _table(archive: Archive) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _number(word: str, which: str) -> float:
-    """Returns a field; NaN where it is empty."""
+    """Reads a field; NaN where it is empty."""
     try:
         value = float(word) if word else 0.0
     except ValueError:
@@ -150,7 +150,7 @@ def _number(word: str, which: str) -> float:
 
 
 def _camera_matrix(archive: Archive) -> np.ndarray:
-    """Returns fx, fy, cx, cy of all frames, [4]."""
+    """Reads fx, fy, cx, cy of all frames, [4]."""
     name = "camera_matrix.csv"
     K = read_matrix(archive.where(name), 3, 3, archive.read(name).replace(b",", b" "))
     return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])

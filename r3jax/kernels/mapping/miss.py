@@ -21,7 +21,7 @@ _SHARE, _LEAST = np.float32(constants.NEAR_ENOUGH), np.float32(constants.LEAST_F
 
 @inlined_fused
 def _is_open(depth, pixel, z, focal, size, limit):
-    """Whether all pixels of a voxel's footprint measure something beyond a limit."""
+    """Checks whether all pixels of a voxel's footprint measure something beyond a limit."""
     height, width = depth.shape
     half = np.int64(math.ceil(focal * _HALF_DIAGONAL * size / z)) + 1
     row, column = pixel // width, pixel % width

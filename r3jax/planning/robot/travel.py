@@ -419,7 +419,7 @@ def cells_over_matter(
 
 
 def _widened(mask: np.ndarray, radius: float) -> np.ndarray:
-    """Cells within whose disk of `radius` [cells], level and round the middle, the mask holds."""
+    """Grows a mask by a level disk of `radius` [cells] round the middle of each cell."""
     reach = int(np.ceil(radius + 0.5)) - 1
     padded = np.pad(mask, ((reach, reach), (reach, reach), (0, 0)))
     wide = mask.copy()

@@ -499,7 +499,7 @@ def _shade_all(
     faces, corner_colors, materials, texels, sizes, offsets, lamps, ambient,
     face, u, v, distance, directions, origins, mirrors, before, steps, workers, colors,
 ):  # fmt: skip
-    """Colors all hits. Flat arguments: Numba's threads take no nested ones."""
+    """Colors all hits. The arguments are flat: Numba's threads take no nested ones."""
     num, has_lamps = face.shape[0], lamps.shape[0] > 0
     blocks = (num + BLOCK - 1) // BLOCK
     for worker in prange(workers):
