@@ -152,6 +152,8 @@ def ranks(a: np.ndarray, b: np.ndarray) -> tuple[float, float, float]:
 
 
 def _spearman(a: np.ndarray, b: np.ndarray) -> float:
+    if np.ptp(a) == 0.0 or np.ptp(b) == 0.0:  # a sample of equal values has no ranks
+        return float("nan")
     found: Any = spearmanr(a, b)
     return float(found.statistic)
 
