@@ -38,6 +38,9 @@ _MAX_CONTRADICTED = 0.4
 _MAX_OF_FITTING = 0.25
 """Up to this share of contradicted points, another convention fits."""
 
+_SUSPECTED = 3
+"""Pairs in a row after which another convention is named: walls of two rooms may fit by chance."""
+
 _MAX_FRAMES = 200
 """Frames after which the question is dropped: a camera that hardly moves settles nothing."""
 
@@ -58,7 +61,10 @@ class Reference(eqx.Module):
     """Frames that were compared so far."""
 
     suspect: str = ""
-    """Another convention, by which two frames overlapped that do not as given."""
+    """Another convention, by which frames overlapped that do not as given."""
+
+    num_suspected: int = 0
+    """Pairs in a row that suggest `suspect`."""
 
     is_settled: bool = False
     """True: there is nothing left to compare."""
@@ -92,17 +98,22 @@ def check_poses(reference: Reference | None, frame: Frame) -> Reference:
         )
         return replace(reference, is_settled=True)
     if math.isnan(given):
-        # As given, the frames do not overlap. That they do otherwise may be chance, but not twice;
+        # As given, the frames do not overlap. That they do otherwise may be chance, but not often;
         # "ros" makes a roll of a look aside, by which any two walls fit.
-        suspect = fitting if fits and fitting != "ros" else ""
-        if suspect and suspect == reference.suspect:
+        if not fits or fitting == "ros":
+            return replace(now, suspect=reference.suspect, num_suspected=reference.num_suspected)
+        pairs = reference.num_suspected + 1 if fitting == reference.suspect else 1
+        if pairs >= _SUSPECTED:
             _warn("frames overlap that should not", fitting, fits)
             return replace(now, is_settled=True)
-        return replace(now, suspect=suspect or reference.suspect)
+        return replace(now, suspect=fitting, num_suspected=pairs)
     # Settled once every other convention would have been noticed in the same pair.
     if all(not share <= _MAX_CONTRADICTED for share in shares.values()):
         return replace(reference, is_settled=True)
-    return replace(reference, num_compared=num, is_settled=now.is_settled)
+    # The frames fit as given, so what suggested another convention was chance.
+    return replace(
+        reference, num_compared=num, is_settled=now.is_settled, suspect="", num_suspected=0
+    )
 
 
 def _warn(finding: str, fitting: str, fits: bool) -> None:

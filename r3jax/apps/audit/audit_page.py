@@ -64,7 +64,7 @@ def write_report(audit: Audit, folder: Path, files: Iterable[Path] = ()) -> Path
         "apps/audit/audit_page.html",
         kind="audit",
         title=f"Audit of {audit.source.name}",
-        lead=[],
+        lead=sentences.first_things(audit),
         cards={},
         state=sentences.state(audit),
         headline=sentences.headline(audit),

@@ -51,6 +51,9 @@ GOOD, _AGAIN = 0.85, 0.3
 """Shares seen well enough: from the first on a capture is good for splats; below the second hardly
 anything can be kept."""
 
+_MOST = 0.5
+"""Share of the pictures that must have a pose."""
+
 _SEVERE = ("pose", "scale", "ray", "camera", "stray")
 """Faults that spoil a model, however much is seen."""
 
@@ -143,6 +146,12 @@ def verdict(audit: Audit) -> list[str]:
             f"About {area(audit, audit.unseen_area)} bordering free space was never photographed."
         )
     return sentences if audit.survey.is_one_place else [*sentences, *_promises(audit)]
+
+
+def first_things(audit: Audit) -> list[str]:
+    """Lists what a reader must know before the verdict: pictures that are not in it."""
+    remark = audit.source.remark
+    return [*([] if remark is None else [remark]), *unread(audit), *without_depth(audit)]
 
 
 def _surfaces(audit: Audit) -> str:
@@ -387,10 +396,16 @@ def state(audit: Audit) -> str:
     if survey.doubt is not None or survey.is_one_place or not faults.fits:
         return "again"
     fine = cause_share(audit, "fine")
-    if fine < _AGAIN:
+    if fine < _AGAIN or _posed_share(audit) < _MOST:
         return "again"
     severe = any(finding.kind in _SEVERE for finding in faults.findings)
     return "good" if fine >= GOOD and not severe else "gaps"
+
+
+def _posed_share(audit: Audit) -> float:
+    """Returns the share of the pictures that a structure from motion found a pose for."""
+    model = audit.source.reconstruction
+    return 1.0 if model is None else model.posed / max(model.pictures, 1)
 
 
 def headline(audit: Audit) -> str:
@@ -400,6 +415,9 @@ def headline(audit: Audit) -> str:
         return f"{words}: depth and cameras contradict each other."
     if audit.survey.is_one_place:
         return f"{words}: all pictures were taken from one place."
+    model = audit.source.reconstruction
+    if model is not None and _posed_share(audit) < _MOST:
+        return f"{words}: only {model.posed} of {model.pictures} pictures have a pose."
     fine = f"{100 * cause_share(audit, 'fine'):.0f} %"
     if audit.source.is_complete:
         return (
@@ -450,7 +468,11 @@ def _about_surfaces(audit: Audit) -> list[tuple[float, str, str]]:
         return [(missing[c], _DO[c], what(c)) for c in told]
     count = len(audit.plan.views)
     seen = [f"{100 * missing[cause]:.0f} % {SHORT[cause]}" for cause in told]
-    rest = f"What was seen {listed(seen)} is in sight there." if seen else "Little is missing."
+    rest = (
+        f"What was seen {listed(seen)} is in sight there."
+        if seen
+        else "They look at what was seen least well; little is missing of what is known."
+    )
     return [
         (1.0, "Take the picture below" if count == 1 else f"Take the {count} pictures below", rest)
     ]
