@@ -309,6 +309,10 @@ def place_link(path: Path, target: Path) -> bool:
     return True
 
 
+PNG_MARK = b"tEXtSoftware\x00r3jax"
+"""What every picture of ours holds: it may be replaced by the next."""
+
+
 def check_replaceable(path: Path, mark: bytes) -> None:
     """Refuses a file that the user named, if one is there that does not hold our mark.
 

@@ -299,7 +299,10 @@ def join_on_rows(
         max_range: pixels farther away do not count [audit units].
     """
     add = by_platform(cpu=_join_by_kernels, default=_join_by_formulas)
-    return add(part, whole, frame, reach, drop_edges, max_range)
+    after = add(part, whole, frame, reach, drop_edges, max_range)
+    # A first measurement voids a row's marks, as its voxel may have been removed. None is here.
+    marks = part.visited | after.visited, jnp.maximum(part.resolution, after.resolution)
+    return eqx.tree_at(lambda m: (m.visited, m.resolution), after, marks)
 
 
 def _join_by_formulas(

@@ -12,17 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from r3jax.errors import InputError
-from r3jax.evaluation.contact_sheet import SheetView, contact_sheet
 from r3jax.evaluation.evaluate import Evaluation, evaluate
 from r3jax.evaluation.image_metrics import load_lpips
 from r3jax.evaluation.maps import expected_image, expected_renderability, map_of
 from r3jax.evaluation.scores import Summary, summarize, worst_rows, write_rows
-from r3jax.files import check_replaceable, holds, make_folder, write_atomic
+from r3jax.files import PNG_MARK, check_replaceable, holds, make_folder, write_atomic
 from r3jax.formats.captures import Capture, open_capture
 from r3jax.formats.errors import FormatError
 from r3jax.frame import Frame
 from r3jax.mapping.state import MapState
-from r3jax.plots import style
 from r3jax.runs.header import package_versions
 from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.model import TrainedModel
@@ -251,7 +249,7 @@ _MARKS = {
     "json": b'"bootstrap_seed"',
     "csv": b"view,psnr,",
     "parquet": b"renderability",
-    "png": style.PNG_MARK,
+    "png": PNG_MARK,
 }
 """What the files of a judgment hold, by their suffix."""
 
@@ -293,7 +291,10 @@ def write_judgment(
     record = _record(judgment, spec)
     if worst:
         written["worst views"] = folder / "evaluation.png"
-        sheet = style.to_png(_sheet(judgment, worst))
+        # Lazy import: training, which judges nothing, needs no plots.
+        from r3jax.plots.style import to_png
+
+        sheet = to_png(_sheet(judgment, worst))
         record["sheet_sha256"] = hashlib.sha256(sheet).hexdigest()
         write_atomic(written["worst views"], sheet)
     text = json.dumps(sealed(record), indent=1, allow_nan=False)
@@ -329,6 +330,8 @@ def _record(judgment: Judgment, spec: str) -> dict[str, Any]:
 
 def _sheet(judgment: Judgment, worst: int):
     """Draws the contact sheet of the worst views."""
+    from r3jax.evaluation.contact_sheet import SheetView, contact_sheet
+
     rows, renders = judgment.evaluation.rows, judgment.evaluation.renders
     place = {row.view: i for i, row in enumerate(rows)}
     lines: list[SheetView] = []

@@ -116,10 +116,6 @@ def color_bar(
     bar.ax.tick_params(labelsize=8, colors=MUTED)
 
 
-PNG_MARK = b"tEXtSoftware\x00r3jax"
-"""What every picture of `to_png` holds: it may be replaced by the next."""
-
-
 def to_png(figure: Figure) -> bytes:
     """Encodes the figure as PNG.
 

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 
-from r3jax.apps.report.report import write_report
 from r3jax.cli.console import Console, Stages, Table, Text, TrainProgress
 from r3jax.cli.errors import one_line
 from r3jax.cli.options.models import EvaluateOptions, ModelFolderOptions, TrainOptions
@@ -132,6 +131,9 @@ def run_evaluate(options: EvaluateOptions) -> int:
         written = write_judgment(judgment, folder, options.views, results.rows, results.worst)
         if capture.run is not None and folder == default:
             _, state, grid = capture.run.checkpoint()
+            # Lazy import: training needs no plots.
+            from r3jax.apps.report.report import write_report
+
             written["report"] = write_report(capture.run, state, grid, stages.on_progress)
     _show_judgment(Console(), judgment, written)
     if capture.run is not None:

@@ -8,9 +8,7 @@ from pathlib import Path
 
 from r3jax.apps.forecast.forecast import Outlook
 from r3jax.apps.forecast.psnr import default_calibration, read_calibration
-from r3jax.apps.report.figures import LEVEL, outlook_figure, outlook_lines
 from r3jax.apps.report.summary import stage_times, summary
-from r3jax.apps.viewer.film import export_film, load_av
 from r3jax.cli.console import Console, Stages, Table, Text
 from r3jax.cli.errors import check_viser
 from r3jax.cli.options.runs import (
@@ -25,14 +23,13 @@ from r3jax.cli.options.runs import (
 from r3jax.errors import InputError
 from r3jax.exploration.config import DEPTH_STEPS_PER_METRE
 from r3jax.exploration.state import describe_counts
-from r3jax.files import check_replaceable, make_folder, write_atomic
+from r3jax.files import PNG_MARK, check_replaceable, make_folder, write_atomic
 from r3jax.formats.exports import export_run, write_data_set
 from r3jax.formats.recordings import is_recording, read_recording
 from r3jax.formats.submissions import submission_of_run, write_submission
 from r3jax.interrupts import check_interrupt, deferred_interrupt, end_process
 from r3jax.network import exposure_warning
 from r3jax.planning.registry import describe, policy_names, source_of
-from r3jax.plots.style import PNG_MARK, to_png
 from r3jax.runs.begin import merge_runs
 from r3jax.runs.reader import Run, read_run
 from r3jax.runs.replay import differences, states_of
@@ -108,7 +105,7 @@ def _show_run(console: Console, path: Path) -> None:
 
 def _show_recording(console: Console, options: InfoOptions, path: Path) -> None:
     from r3jax.apps.report.figures import FrameReport, follow_recording, revisit_figure
-    from r3jax.plots.style import PNG_MARK, to_png
+    from r3jax.plots.style import to_png
 
     if options.plot is not None:
         check_replaceable(options.plot, PNG_MARK)
@@ -193,6 +190,10 @@ def run_forecast(options: ForecastOptions) -> int:
     Raises:
         ValueError, OSError: not a run, a frame that is missing, or a file that is no calibration.
     """
+    # Lazy import: other commands on runs need no plots.
+    from r3jax.apps.report.figures import LEVEL, outlook_figure, outlook_lines
+    from r3jax.plots.style import to_png
+
     console = Console(stderr=True)
     if options.plot is not None:
         check_replaceable(options.plot, PNG_MARK)
@@ -321,6 +322,9 @@ def _export_images(run: Run, out: Path, video: bool, console: Console) -> int:
     Raises:
         FormatError, RunError, ImportError, OSError: as `export_film`.
     """
+    # Lazy import: other commands on runs need no plots.
+    from r3jax.apps.viewer.film import export_film, load_av
+
     if video:
         load_av()  # says what is missing before an hour has passed
     with Stages(console) as stages:
