@@ -28,10 +28,11 @@ from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import Candidates, candidates_along, path_lengths, random_views
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo, Situation
-from r3jax.planning.robot.body import Body, room_for
+from r3jax.planning.robot.body import Body
 from r3jax.planning.robot.explorable import mask_unexplorable
 from r3jax.planning.robot.limits import Limits
 from r3jax.planning.robot.motion import Motion
+from r3jax.planning.robot.room import room_for
 from r3jax.planning.robot.travel import Travel, plan_travel
 from r3jax.scoring.explain import Explanation, explain_view
 from r3jax.scoring.utility import visible_unexplored

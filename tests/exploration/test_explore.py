@@ -133,7 +133,7 @@ def test_the_last_view_arrives_within_the_budget(budget):
     assert len(result.rows) > 1
     mapping = CONFIG.mapping_seconds  # the last picture is taken in time, mapped after
     assert getattr(result.state, limit.unit) <= limit.amount + mapping
-    assert limit.shown in result.message
+    assert limit.words in result.message
     assert "metres" not in result.message
 
 

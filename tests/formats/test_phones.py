@@ -213,7 +213,7 @@ def test_record3d_of_earlier_versions_has_one_camera_and_no_size_of_depth(tmp_pa
 def test_record3d_without_lzfse_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "lzfse", None)
     path = write_zip(tmp_path / "scan.r3d", {"metadata": b"{}", "rgbd/0.jpg": b""})
-    with pytest.raises(FormatError, match=r"scan\.r3d: .*pip install 'r3jax\[phones\]'"):
+    with pytest.raises(FormatError, match=r"scan\.r3d: .*pip install 'r3jax\[video\]'"):
         open_capture(path)
 
 
@@ -324,7 +324,7 @@ def test_stray_scanner_without_a_matrix_says_so(tmp_path):
 
 def test_a_video_without_pyav_names_the_extra(stray, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(FormatError, match=r"rgb\.mp4: .*pip install 'r3jax\[phones\]'"):
+    with pytest.raises(FormatError, match=r"rgb\.mp4: .*pip install 'r3jax\[video\]'"):
         open_capture(stray)
 
 

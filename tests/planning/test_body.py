@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from r3jax.mapping.occupancy import OccupancyGrid
-from r3jax.planning.robot.body import Body, Room, room_for
+from r3jax.planning.robot.body import Body
 from r3jax.planning.robot.motion import make_motion, motion_of_record
+from r3jax.planning.robot.room import Room, room_for
 from r3jax.planning.robot.travel import plan_travel
 from r3jax.runs.header import plain_settings
 

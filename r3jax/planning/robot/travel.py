@@ -25,8 +25,8 @@ import numpy as np
 from r3jax.errors import InputError
 from r3jax.kernels.robot.shortest_paths import shortest_paths
 from r3jax.mapping.occupancy import OccupancyGrid
-from r3jax.planning.robot.body import Room
 from r3jax.planning.robot.motion import UNLIMITED, check_height
+from r3jax.planning.robot.room import Room
 
 _INSET = 1e-2
 """A camera at a fixed height that is a border of layers counts as so far inside its own [cells]:

@@ -1,0 +1,410 @@
+"""Where there is room for a body: a plan of the place for a robot, a drone or a person.
+
+A *sphere* round a flying camera must touch known free cells only (`travel.safe_cells`). A
+*footprint* stands on the floor and reaches up to some height; for it `room_for` draws a plan of the
+place, seen from above, as Nav2's obstacle layer does, and measures in it how far each place is from
+everything that the body must not touch:
+
+- voxels of the map between a step above the floor and the top of the body. The floor itself is
+  found from the robot on outwards, so that ramps and a noisy floor are no obstacles;
+- occupied cells of the grid in which the map has no voxel (thin things, whose pixels lie on edges);
+- keep-out zones and the obstacles of a costmap (`OccupancyGrid.closed`);
+- columns of cells that are not known. A cell counts as known whether it is free or occupied:
+  what in it is an obstacle, the voxels say. Where the robot has stood is known.
+
+Cells below the camera that it cannot see count as `unknown_below` says.
+
+On the host: NumPy and SciPy. Shape symbols: X Y Z cells; x y pixels of the plan; n points.
+"""
+
+import functools
+import itertools
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import ndimage
+
+from r3jax.geometry.cameras import Camera
+from r3jax.kernels.robot.shortest_paths import shortest_paths
+from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.planning.robot.body import Body
+
+PIXELS_PER_CELL = 4
+"""Pixels of the plan along the edge of a cell: 5 cm."""
+
+_FLOOR_WITHIN = 3.0
+"""The floor is looked for this far round the robot [m]."""
+
+_FLOOR_SHARE = 0.25
+"""The floor is the lowest level with this share of the voxels of the fullest one."""
+
+_MAX_BLIND = 2.0
+"""However little a camera sees of the floor, unseen floor is no freer than this far from where the
+robot has been [m]."""
+
+_LEAVING = 0.3
+"""Within this distance of the robot the margin is not needed [m]: it stands there already."""
+
+_OVERLAP = 0.25
+"""A layer of which the body takes less than this share of a cell need not be known [cells]."""
+
+
+@dataclass(frozen=True)
+class Room:
+    """A plan of the place for one body. Made by `room_for`."""
+
+    distance: np.ndarray
+    """From each pixel's center to the nearest that the body must not touch [m], [x, y]."""
+
+    origin: np.ndarray
+    """Lower corner of pixel (0, 0) [m], [2]."""
+
+    pixel: float
+    """Side of a pixel [m]."""
+
+    needed: float
+    """Least distance of the body's middle [m]."""
+
+    stop: np.ndarray
+    """Flat index of the pixel where the robot stops in each column, [X, Y]; -1: nowhere."""
+
+    cost: np.ndarray
+    """Length of the shortest path to each of these [m], [X, Y]; inf: there is none."""
+
+    previous: np.ndarray
+    """Flat index of the pixel before each on that path, [x * y]; -1 at its start."""
+
+    floor: np.ndarray
+    """Height of the floor [m], [X, Y]."""
+
+    counts: dict[str, int] = field(default_factory=dict[str, int])
+    """Columns round the robot, by what closes them."""
+
+    @property
+    def columns(self) -> np.ndarray:
+        """Columns of cells in which the body fits somewhere, [X, Y] bool."""
+        return self.stop >= 0
+
+    def places(self, pixels: np.ndarray) -> np.ndarray:
+        """Computes the centers of pixels given by flat index [...], [..., 2] [m]."""
+        index = np.stack(np.unravel_index(pixels, self.distance.shape), axis=-1)
+        return self.origin + (index + 0.5) * self.pixel
+
+    def path(self, column: tuple[int, int]) -> np.ndarray:
+        """Lists the pixels' centers from the robot to its stop in a column, [K, 2] [m]."""
+        pixels = [int(self.stop[column])]
+        while self.previous[pixels[-1]] >= 0:
+            pixels.append(int(self.previous[pixels[-1]]))
+        return self.places(np.array(pixels[::-1]))
+
+    def fits(self, points: np.ndarray) -> np.ndarray:
+        """Checks if the body fits at points [..., 2 or 3] [m]."""
+        index = np.floor((points[..., :2] - self.origin) / self.pixel).astype(np.int64)
+        is_inside = np.all((index >= 0) & (index < self.distance.shape), axis=-1)
+        x, y = np.moveaxis(np.where(is_inside[..., None], index, 0), -1, 0)
+        return is_inside & (self.distance[x, y] >= self.needed)
+
+    def fits_along(self, start: np.ndarray, ends: np.ndarray) -> np.ndarray:
+        """Checks if the body fits everywhere on the straight lines to ends [n, 3] [m], [n] bool."""
+        gap = ends[:, :2] - start[:2]
+        if not len(gap):
+            return np.zeros(0, bool)
+        # The start itself is not asked: the robot stands there.
+        num = max(int(np.ceil(np.linalg.norm(gap, axis=1).max() / (0.5 * self.pixel))), 1)
+        shares = np.arange(1, num + 1) / num
+        return np.asarray(self.fits(start[:2] + shares[:, None, None] * gap).all(axis=0))
+
+
+def room_for(
+    body: Body,
+    grid: OccupancyGrid,
+    voxels: np.ndarray,
+    voxel_size: float,
+    T_world_camera: np.ndarray,
+    camera: Camera | None = None,
+    trail: np.ndarray | None = None,
+) -> Room:
+    """Draws the plan in which a body with a footprint moves.
+
+    Args:
+        body: its `heights` are not None.
+        grid: what is known.
+        voxels: centers of the map's voxels, [n, 3] [m].
+        voxel_size: edge of a voxel [m].
+        T_world_camera: where the camera is, [4, 4].
+        camera: its lens, which tells how near it sees the floor; None: it does not.
+        trail: cells that the robot has come through, [X, Y, Z] bool.
+    """
+    known = _Known.of(body, grid, voxels, voxel_size, T_world_camera, trail)
+    blind = _blind_radius(camera, T_world_camera, known.height)
+    thin = known.thin_obstacles()
+    passable = known.columns(blind, thin) & ~thin
+    num, shape = PIXELS_PER_CELL, known.free.shape
+    pixel = known.size / num
+    closed = np.repeat(np.repeat(~passable, num, axis=0), num, axis=1)
+    low, position = known.origin, known.position
+    x, y = (low[i] + pixel * (np.arange(closed.shape[i]) + 0.5) - position[i] for i in range(2))
+    own = np.hypot(x[:, None], y[None, :])
+    # Where the robot stands is known, whatever the cells say.
+    closed &= own > body.needed + pixel
+    if grid.closed is not None:
+        zones = grid.closed.any(axis=2)
+        closed |= np.repeat(np.repeat(zones, num, axis=0), num, axis=1)
+    hit = np.floor((known.obstacles[:, :2] - low[:2]) / pixel).astype(np.int64)
+    obstacles = np.zeros_like(closed)
+    obstacles[tuple(np.clip(hit, 0, np.array(closed.shape) - 1).T)] = True
+    # The robot is not inside of anything: what seems to be there is itself, or noise.
+    obstacles &= own > body.radius
+    # Beyond the grid nothing is known.
+    blocked = np.pad(closed | obstacles, 1, constant_values=True)
+    distance = np.asarray(ndimage.distance_transform_edt(~blocked))[1:-1, 1:-1] * pixel
+    stop, cost, previous = _search(distance, own, pixel, num, body)
+    near = own.reshape(shape[0], num, shape[1], num).min(axis=(1, 3)) <= body.needed + 0.5
+    hit_columns = obstacles.reshape(shape[0], num, shape[1], num).any(axis=(1, 3)) | thin
+    counts = {
+        "near": int(near.sum()),
+        "unknown": int((near & ~passable & ~thin).sum()),
+        "obstacle": int((near & hit_columns).sum()),
+        "open": int((near & np.isfinite(cost)).sum()),
+    }
+    return Room(
+        distance, low[:2].copy(), pixel, body.needed, stop, cost, previous, known.floor, counts
+    )
+
+
+@dataclass(frozen=True)
+class _Known:
+    """What is known of the cells that a body would take up."""
+
+    body: Body
+    free: np.ndarray
+    occupied: np.ndarray
+    origin: np.ndarray
+    size: float
+    voxels: np.ndarray
+    """Centers of voxels within the grid, [n, 3] [m]."""
+    above: np.ndarray
+    """Their heights above the floor of their columns, [n] [m]."""
+    cells: np.ndarray
+    """The cells that hold them, [n, 3]."""
+    voxel_size: float
+    position: np.ndarray
+    """The camera's, [3] [m]."""
+    height: float
+    """Of the camera above the floor [m]."""
+    floor: np.ndarray
+    """Height of the floor, [X, Y] [m]."""
+    within: np.ndarray
+    """Cells that the body would take up, [X, Y, Z] bool."""
+    low: float
+    """Lowest part above the floor, at least a step [m]."""
+    top: np.ndarray
+    """Highest part, world, [X, Y] [m]."""
+    been: np.ndarray
+    """Columns that the robot has come through, its own included, [X, Y] bool."""
+
+    @classmethod
+    def of(
+        cls, body: Body, grid: OccupancyGrid, voxels: np.ndarray, voxel_size: float,
+        T_world_camera: np.ndarray, trail: np.ndarray | None,
+    ) -> "_Known":  # fmt: skip
+        """Finds the floor, and from it on which cells the body takes up."""
+        assert body.heights is not None
+        size, origin = float(grid.cell_size), np.asarray(grid.origin, np.float64)
+        free, occupied = np.asarray(grid.free), np.asarray(grid.occupied)
+        shape, position = free.shape, np.asarray(T_world_camera, np.float64)[:3, 3]
+        # What is higher than any body can be no obstacle, and no floor.
+        tallest = position[2] + (body.heights[1] or 0.0) + size
+        voxels = voxels[voxels[:, 2] < tallest]
+        cells = np.floor((voxels - origin) / size).astype(np.int64)
+        inside = np.all((cells >= 0) & (cells < shape), axis=1)
+        voxels, cells = voxels[inside], cells[inside]
+        start = _floor_at(body, voxels, voxel_size, occupied, origin, size, position)
+        floor = _floor_map(voxels, cells, voxel_size, shape, origin, size, position, start)
+        x, y = np.clip(_column(position, origin, size), 0, np.array(shape[:2]) - 1)
+        height = float(position[2] - floor[x, y])
+        high = height if body.heights[1] is None else body.heights[1]
+        low = max(body.heights[0], body.step)
+        bottom, top = floor + low, floor + max(high, low + 0.5 * voxel_size)
+        lower = origin[2] + size * np.arange(shape[2])
+        overlap = np.minimum(lower + size, top[..., None]) - np.maximum(lower, bottom[..., None])
+        # At least one layer counts, however thin the body is.
+        thickest = overlap.max(axis=2, keepdims=True)
+        within = overlap > np.minimum(_OVERLAP * size, 0.99 * thickest)
+        been = np.zeros(shape[:2], bool)
+        if trail is not None:
+            been |= np.asarray(trail).any(axis=2)
+        own = _column(position, origin, size)
+        if np.all((own >= 0) & (own < shape[:2])):
+            been[tuple(own)] = True
+        above = voxels[:, 2] - floor[cells[:, 0], cells[:, 1]]
+        return cls(body, free, occupied, origin, size, voxels, above, cells, voxel_size, position,
+                   height, floor, within, low, top, been)  # fmt: skip
+
+    @property
+    def obstacles(self) -> np.ndarray:
+        """Centers of voxels that the body would touch, [n, 3] [m]."""
+        top = self.top[self.cells[:, 0], self.cells[:, 1]]
+        # A tenth of a voxel of grace: the floor itself is known no better.
+        is_above = self.above > self.low + 0.1 * self.voxel_size
+        return self.voxels[is_above & (self.voxels[:, 2] - 0.5 * self.voxel_size < top)]
+
+    @functools.cached_property
+    def has_voxel(self) -> np.ndarray:
+        """Cells into which a voxel reaches, [X, Y, Z] bool."""
+        found, last = np.zeros(self.free.shape, bool), np.array(self.free.shape) - 1
+        low, high = (
+            np.clip(np.floor((self.voxels + half - self.origin) / self.size), 0, last).astype(int)
+            for half in (-0.5 * self.voxel_size, 0.5 * self.voxel_size)
+        )
+        for x, y, z in itertools.product((low, high), repeat=3):
+            found[x[:, 0], y[:, 1], z[:, 2]] = True
+        return found
+
+    def thin_obstacles(self) -> np.ndarray:
+        """Finds columns with an occupied cell above the floor that no voxel explains, [X, Y]."""
+        lower = self.origin[2] + self.size * np.arange(self.free.shape[2])
+        floor, step = self.floor[..., None], self.body.step
+        holds_floor = (lower < floor + step) & (lower + self.size > floor - step)
+        return (self.within & self.occupied & ~self.has_voxel & ~holds_floor).any(axis=2)
+
+    def columns(self, blind: float, thin: np.ndarray) -> np.ndarray:
+        """Finds columns of which enough is known for the body to stand in them, [X, Y] bool."""
+        known = (self.free | self.occupied | self.has_voxel | ~self.within).all(axis=2)
+        radius = self.body.needed / self.size
+        known |= _dilated(self.been, radius)
+        if self.body.unknown_below == "never":
+            return known
+        at_floor = self.cells[np.abs(self.above) <= 1.3 * self.voxel_size]
+        known[at_floor[:, 0], at_floor[:, 1]] = True
+        lowest = np.argmax(self.within, axis=2)[..., None]
+        known |= np.take_along_axis(self.free, lowest, axis=2)[..., 0]
+        if blind <= 0.0:
+            return known
+        hit = np.zeros(known.shape, bool)
+        tall = self.cells[self.above > self.body.step + self.voxel_size]
+        hit[tall[:, 0], tall[:, 1]] = True
+        # Round obstacles, not through them: what hides behind a table is not the blind spot.
+        near, square = _dilated(self.been, radius), np.ones((3, 3), bool)
+        for i in range(int(np.ceil(blind / self.size / 0.85))):
+            near = np.asarray(ndimage.binary_dilation(near, None if i % 2 else square, mask=~hit))
+        gap = 0.5 * blind / self.size + 1.0
+        pad = int(np.ceil(gap)) + 1
+        closed = np.asarray(ndimage.binary_closing(np.pad(known, pad), _disk(gap)))
+        around = closed[pad:-pad, pad:-pad]
+        return known | (np.asarray(near, bool) & np.asarray(around, bool) & ~thin)
+
+
+def _search(
+    distance: np.ndarray, own: np.ndarray, pixel: float, num: int, body: Body
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Searches shortest paths over the plan, and the roomiest reachable pixel of each column.
+
+    Returns:
+        The pixel's flat index and the length of the path to it [m], [X, Y] each; and the flat index
+        of the pixel before each pixel, [x * y].
+    """
+    # Where it stands the robot fits, and it may leave the margin of what has come near.
+    usable = (distance >= body.needed) | ((own < _LEAVING) & (distance >= body.radius))
+    start = np.unravel_index(np.argmin(own), own.shape)
+    is_inside = own[start] < pixel
+    usable[start] |= is_inside
+    first = (int(start[0]), int(start[1]), 0) if is_inside else None
+    cost, previous = shortest_paths(usable[:, :, None], first)
+    cost, previous = cost[:, :, 0] * pixel, previous[:, :, 0].reshape(-1)
+    x, y = distance.shape[0] // num, distance.shape[1] // num
+    by_cell = lambda a: a.reshape(x, num, y, num).transpose(0, 2, 1, 3).reshape(x, y, num * num)
+    fits = np.where(distance >= body.needed, distance, -np.inf)
+    # Of those that can be reached, if there are any.
+    best = np.argmax(by_cell(np.where(np.isfinite(cost), fits + 1e3, fits)), axis=2)[..., None]
+    pick = lambda a: np.take_along_axis(by_cell(a), best, axis=2)[..., 0]
+    stop = np.where(pick(fits) > 0.0, pick(np.arange(cost.size).reshape(cost.shape)), -1)
+    return stop, np.where(stop >= 0, pick(cost), np.inf), previous
+
+
+def _column(position: np.ndarray, origin: np.ndarray, size: float) -> np.ndarray:
+    return np.floor((position[:2] - origin[:2]) / size).astype(np.int64)
+
+
+def _floor_at(
+    body: Body, voxels: np.ndarray, voxel_size: float, occupied: np.ndarray,
+    origin: np.ndarray, size: float, position: np.ndarray,
+) -> float:  # fmt: skip
+    """Finds the height of the floor under the robot [m]: given, seen, or the box's lower bound."""
+    if body.floor is not None:
+        return body.floor
+    gap = np.linalg.norm(voxels[:, :2] - position[:2], axis=1)
+    z = voxels[(gap < _FLOOR_WITHIN) & (voxels[:, 2] < position[2] + voxel_size), 2]
+    if len(z) >= 20:
+        level = np.rint((z - z.min()) / voxel_size).astype(np.int64)
+        count = np.bincount(level)
+        lowest = int(np.argmax(count >= _FLOOR_SHARE * count.max()))
+        # A floor on the border of two levels fills both of them.
+        is_floor = (level == lowest) | (
+            (level == lowest + 1) & (count[level] >= 0.5 * count[lowest])
+        )
+        return float(z[is_floor].mean())
+    x, y = np.clip(_column(position, origin, size), 0, np.array(occupied.shape[:2]) - 1)
+    below = np.flatnonzero(
+        occupied[x, y] & (origin[2] + size * (np.arange(occupied.shape[2]) + 1) < position[2])
+    )
+    # The grid has one layer more than its box.
+    return float(origin[2] + size * (1 + (below[0] if len(below) else 0)))
+
+
+def _floor_map(
+    voxels: np.ndarray, cells: np.ndarray, voxel_size: float, shape: tuple[int, ...],
+    origin: np.ndarray, size: float, position: np.ndarray, start: float,
+) -> np.ndarray:  # fmt: skip
+    """Maps the height of the floor [m], [X, Y]: by at most a voxel up or down from cell to cell."""
+    low = np.floor(origin[2] / voxel_size)
+    num = int(np.ceil(shape[2] * size / voxel_size)) + 2
+    level = np.clip(np.floor(voxels[:, 2] / voxel_size) - low, 0, num - 1).astype(np.int64)
+    # How many, not whether any: a stray voxel of noise must not lift the floor.
+    filled = np.zeros((*shape[:2], num))
+    np.add.at(filled, (cells[:, 0], cells[:, 1], level), 1.0)
+    heights = (low + np.arange(num) + 0.5) * voxel_size
+    floor = np.full(shape[:2], np.nan)
+    x, y = np.clip(_column(position, origin, size), 0, np.array(shape[:2]) - 1)
+    floor[x, y] = start
+    pad = lambda a, fill: np.pad(a, 1, constant_values=fill)
+    for _ in range(sum(shape[:2])):
+        is_known = ~np.isnan(floor)
+        if is_known.all():
+            break
+        values, weights = (
+            pad(np.where(is_known, floor, 0.0), 0.0),
+            pad(is_known, False).astype(float),
+        )
+        near = lambda a: a[:-2, 1:-1] + a[2:, 1:-1] + a[1:-1, :-2] + a[1:-1, 2:]
+        count = near(weights)
+        new = ~is_known & (count > 0)
+        i, j = np.nonzero(new)
+        expected = near(values)[new] / count[new]
+        weight = filled[i, j] * (np.abs(heights - expected[:, None]) <= 1.3 * voxel_size)
+        total = weight.sum(axis=1)
+        found = (weight * heights).sum(axis=1) / np.maximum(total, 1.0)
+        floor[i, j] = np.where(total > 0, found, expected)
+    return np.where(np.isnan(floor), start, floor)
+
+
+def _disk(radius: float) -> np.ndarray:
+    reach = int(np.floor(radius))
+    x = np.arange(-reach, reach + 1)
+    return np.hypot(x[:, None], x[None, :]) <= radius
+
+
+def _dilated(mask: np.ndarray, radius: float) -> np.ndarray:
+    return np.asarray(ndimage.binary_dilation(mask, _disk(radius)))
+
+
+def _blind_radius(camera: Camera | None, T_world_camera: np.ndarray, height: float) -> float:
+    """Computes how far from the robot the image first shows the floor [m]; 0: it never does."""
+    if camera is None:
+        return 0.0
+    T = np.asarray(T_world_camera, np.float64)
+    lowest = np.array([0.0, (camera.height - float(camera.cy)) / float(camera.fy), 1.0])
+    ray = T[:3, :3] @ lowest
+    if ray[2] >= -1e-2 * np.linalg.norm(ray):
+        return 0.0
+    return min(max(height, 0.0) * float(np.hypot(ray[0], ray[1])) / -float(ray[2]), _MAX_BLIND)
