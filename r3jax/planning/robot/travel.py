@@ -6,7 +6,7 @@ neighbors are free, so that every point of a path keeps at least one cell's widt
 anything that is not known to be free. The cell in which the robot stands is always usable.
 
 For a robot with a footprint (`body.Body`) a cell is safe if the footprint fits somewhere in it, by
-the plan that `body.room_for` draws. Paths are searched for and straight lines checked on that plan.
+the plan that `room.room_for` draws. Paths are searched for and straight lines checked on that plan.
 
 Paths run over the 26-connected graph of usable cells. A diagonal step needs every cell of the
 block it crosses, so that it cannot squeeze between two corners. `skimage.graph.MCP_Geometric`
