@@ -192,6 +192,9 @@ def _is(value: Any, hint: Any) -> bool:
         return value in args
     if origin in (typing.Union, types.UnionType):
         return any(_is(value, arg) for arg in args)
+    if origin is tuple and args[1:] != (...,):
+        is_long = isinstance(value, list) and len(value) == len(args)
+        return is_long and all(map(_is, value, args))
     if origin in (list, tuple):
         inner = args[0] if args else Any
         return isinstance(value, list) and all(_is(x, inner) for x in value)

@@ -34,6 +34,7 @@ from r3jax.apps.report.model_report import (
 from r3jax.captures.camera_paths import is_camera_path, read_camera_path
 from r3jax.cli.commands.benchmark import print_results
 from r3jax.cli.console import Console
+from r3jax.errors import InputError
 from r3jax.evaluation import test_views as view_sets
 from r3jax.evaluation.judge import choose_views, mapped_views
 from r3jax.evaluation.test_views import ViewSet, read_view_set
@@ -588,7 +589,7 @@ def read_a_stage(folder: Path) -> None:
 
 
 CALIBRATION = resources("r3jax.apps.forecast") / "calibration.json"
-MISSING_OR_BROKEN = (ValueError, FileNotFoundError)
+MISSING_OR_BROKEN = (InputError, FileNotFoundError)
 OF_A_MODEL = (FormatError, SceneFileError, RunError)
 
 READERS = CAPTURES | {
@@ -618,8 +619,8 @@ READERS = CAPTURES | {
         MISSING_OR_BROKEN,
     ),
     "camera path": Reader(camera_paths, read_a_camera_path, (FormatError,), cases=100),
-    "stage config": Reader(stage_configs, read_a_stage, (ValueError,)),
-    "mesh": Reader(meshes.seeds, meshes.read, (ValueError,)),
+    "stage config": Reader(stage_configs, read_a_stage, (InputError,)),
+    "mesh": Reader(meshes.seeds, meshes.read, (InputError,)),
     "command line": Reader(
         lambda: words.seeds(runs()[0] | models()[0], splats()[0], recordings()[0]),
         words.read,
@@ -634,7 +635,7 @@ READERS = CAPTURES | {
 CRAFTED = {
     "transforms": Reader(hostile_transforms, posed(read_transforms), (FormatError,)),
     "colmap": Reader(hostile_models, posed(read_colmap), (FormatError,)),
-    "mesh": Reader(meshes.crafted, meshes.read, (ValueError,)),
+    "mesh": Reader(meshes.crafted, meshes.read, (InputError,)),
     "command line": Reader(
         lambda: words.crafted(READERS["command line"].seeds()[0]),
         words.read,

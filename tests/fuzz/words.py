@@ -93,7 +93,7 @@ class Refused(Exception):
     """Exit code 2, and one line that says why."""
 
 
-class Begun(Exception):
+class Begun(BaseException):
     """The words make sense: the work would begin."""
 
 
