@@ -64,6 +64,8 @@ def run_command(args: Sequence[str]) -> int:
         InputError: wrong input.
     """
     words = list(args)
+    if odd := [word for word in words if "\0" in word]:
+        raise InputError(f"{odd[0]!r} holds a null byte, which no name and no path can")
     if words == ["--version"]:
         print(f"r3jax {r3jax.__version__}")
         return 0

@@ -3,6 +3,8 @@
 from typing import Any
 
 import equinox as eqx
+import jax
+import numpy as np
 from jaxtyping import Array, Float
 
 from r3jax.errors import InputError
@@ -43,6 +45,9 @@ class ScoringConfig(VisibilityConfig):
             raise InputError(f"kappa must be 'box' or 'one', got {self.kappa!r}")
         if self.delta not in ("trace", "pairwise"):
             raise InputError(f"delta must be 'trace' or 'pairwise', got {self.delta!r}")
+        # A traced weight has no value yet.
+        if not isinstance(self.lambda1, jax.core.Tracer) and not np.isfinite(self.lambda1).all():
+            raise InputError(f"lambda1 (--lambda1) must be finite in float32, got {self.lambda1}")
 
 
 RETIRED = {"sample": "it was off, and no table rests on it; commit 4fa1d20 has it"}

@@ -78,6 +78,8 @@ class TrainOptions:
     def __post_init__(self) -> None:
         """Refuses what no model can be trained on, and what none can be called."""
         check_model(self.path, self.folder.name, self.resolution)
+        if self.hold_out >= 1 << 31:
+            raise InputError(f"--hold-out must be below 2^31, got {self.hold_out}")
 
 
 @dataclass(frozen=True, kw_only=True)
