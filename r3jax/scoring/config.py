@@ -3,8 +3,8 @@
 from typing import Any
 
 import equinox as eqx
-import jax
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from r3jax.errors import InputError
@@ -46,7 +46,7 @@ class ScoringConfig(VisibilityConfig):
         if self.delta not in ("trace", "pairwise"):
             raise InputError(f"delta must be 'trace' or 'pairwise', got {self.delta!r}")
         # A traced weight has no value yet.
-        if not isinstance(self.lambda1, jax.core.Tracer) and not np.isfinite(self.lambda1).all():
+        if not isinstance(self.lambda1, Tracer) and not np.isfinite(self.lambda1).all():
             raise InputError(f"lambda1 (--lambda1) must be finite in float32, got {self.lambda1}")
 
 
