@@ -348,7 +348,9 @@ def _check_parts(header: Submission) -> None:
     check_fields("policy", header.policy, {"name": str, "version": str})
     if header.outcome not in COMPLETE:
         raise ForeignFileError(f"`outcome` must be one of {', '.join(sorted(COMPLETE))}")
-    settings = {"exploration": (header.exploration, ExplorationConfig)}
+    settings: dict[str, tuple[dict[str, Any], type]] = {
+        "exploration": (header.exploration, ExplorationConfig)
+    }
     motion = dict(header.motion or {})
     if isinstance(motion.get("body"), dict):
         settings["motion.body"] = (motion.pop("body"), Body)
