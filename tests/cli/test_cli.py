@@ -262,3 +262,14 @@ def test_progress_says_what_is_happening():
         for step in range(50):
             progress.on_row(make_view(step)[0])
     assert 1 <= len(log.file.getvalue().splitlines()) <= 11
+
+
+def test_the_demo_explores_before_anything_asks_for_its_run(tmp_path, monkeypatch):
+    from r3jax.cli.commands import explore
+    from r3jax.cli.options.explore import DemoOptions
+
+    explored = []
+    monkeypatch.setattr(explore, "run_explore", lambda options: explored.append(options) or 3)
+    assert explore.run_demo(DemoOptions(out=tmp_path)) == 3  # a run that fails is not trained on
+    assert explored[0].folder.name == "demo"
+    assert not (tmp_path / "demo").exists()
