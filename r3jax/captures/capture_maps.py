@@ -20,7 +20,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from r3jax.captures.source import Source
 from r3jax.captures.survey import MARGIN, RANGE, Survey
@@ -38,7 +38,7 @@ from r3jax.mapping.occupancy import (
 )
 from r3jax.mapping.seen import hidden_by_none, mark_seen
 from r3jax.mapping.state import MapState, empty_map
-from r3jax.mapping.update import for_kernels, integrate_pixels, update_growing
+from r3jax.mapping.update import add_pixels, for_kernels, update_growing, with_rows
 
 _CAPACITY = 1 << 15
 _MOST_ROWS = 1 << 22
@@ -223,29 +223,7 @@ def grown(state: MapState, frame: Frame, drop_edges: bool, max_range: float = RA
         ) from error
 
 
-@jax.jit
-def _add_pixels(
-    state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
-) -> MapState:
-    add = by_platform(cpu=_pixels_by_kernel, default=integrate_pixels)
-    return add(state, frame, max_range, drop_edges)
-
-
-def _pixels_by_kernel(
-    state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
-) -> MapState:
-    image = for_kernels(frame, max_range, drop_edges)
-    rows, mean, lost = calls.map_add(state.rows, state.mean, image, state.num_bins)
-    return _with_rows(state, rows, mean, state.dropped + lost)
-
-
-def _with_rows(
-    state: MapState, rows: calls.MapRows, mean: Float[Array, "3 N"], dropped: Int[Array, ""]
-) -> MapState:
-    return MapState(
-        rows.key, rows.visited, rows.counts, mean, rows.m2, rows.resolution, state.voxel_size,
-        dropped, state.num_bins,
-    )  # fmt: skip
+_add_pixels = jax.jit(add_pixels)
 
 
 def _reach(source: Source, frame: Frame) -> Float[Array, ""]:
@@ -298,40 +276,29 @@ def join_on_rows(
         drop_edges: False lets pixels on depth edges in.
         max_range: pixels farther away do not count [audit units].
     """
-    add = by_platform(cpu=_join_by_kernels, default=_join_by_formulas)
-    after = add(part, whole, frame, reach, drop_edges, max_range)
+    after = add_pixels(part, frame, max_range, drop_edges)
     # A first measurement voids a row's marks, as its voxel may have been removed. None is here.
     marks = part.visited | after.visited, jnp.maximum(part.resolution, after.resolution)
-    return eqx.tree_at(lambda m: (m.visited, m.resolution), after, marks)
+    mark = by_platform(cpu=_mark_by_kernel, default=_mark_by_formula)
+    return mark(eqx.tree_at(_marks, after, marks), whole, frame, reach)
 
 
-def _join_by_formulas(
-    part: MapState,
-    whole: MapState,
-    frame: Frame,
-    reach: Float[Array, ""],
-    drop_edges: Bool[Array, ""],
-    max_range: Float[Array, ""],
+_marks = lambda m: (m.visited, m.resolution)
+
+
+def _mark_by_formula(
+    part: MapState, whole: MapState, frame: Frame, reach: Float[Array, ""]
 ) -> MapState:
-    part = integrate_pixels(part, frame, max_range, drop_edges)
-    marks = lambda m: (m.visited, m.resolution)
-    marked = mark_seen(eqx.tree_at(marks, whole, marks(part)), frame, reach)
-    return eqx.tree_at(marks, part, marks(marked))
+    marked = mark_seen(eqx.tree_at(_marks, whole, _marks(part)), frame, reach)
+    return eqx.tree_at(_marks, part, _marks(marked))
 
 
-def _join_by_kernels(
-    part: MapState,
-    whole: MapState,
-    frame: Frame,
-    reach: Float[Array, ""],
-    drop_edges: Bool[Array, ""],
-    max_range: Float[Array, ""],
+def _mark_by_kernel(
+    part: MapState, whole: MapState, frame: Frame, reach: Float[Array, ""]
 ) -> MapState:
-    part = _pixels_by_kernel(part, frame, max_range, drop_edges)
     is_visible = hidden_by_none(whole, frame, reach).astype(jnp.uint8)
-    image = for_kernels(frame, reach, drop_edges)
-    rows = calls.map_mark(part.rows, image, is_visible, part.num_bins)
-    return _with_rows(part, rows, part.mean, part.dropped)
+    image = for_kernels(frame, reach, jnp.asarray(False))  # edges matter to pixels only
+    return with_rows(part, calls.map_mark(part.rows, image, is_visible, part.num_bins))
 
 
 def united(parts: Sequence[MapState]) -> MapState:

@@ -4,6 +4,7 @@ Shape symbols: P points of a frame; M observations that join at once; H W image 
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -135,29 +136,47 @@ def _by_kernels(
     state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
 ) -> MapState:
     """Integrates a frame by machine code."""
+    after = _pixels_by_kernel(state, frame, max_range, drop_edges)
+    factor = nan_unless_valid(frame.camera, frame.T_world_camera)
+    image = for_kernels(frame, factor * max_range, drop_edges)
+    if after.misses is not None:
+        rows, mean, misses = calls.map_miss(after.rows, after.mean, after.misses, image)
+        after = with_rows(after, rows, mean=mean, misses=misses)
+    is_visible = hidden_by_none(after, frame, max_range).astype(jnp.uint8)
+    return with_rows(after, calls.map_mark(after.rows, image, is_visible, state.num_bins))
+
+
+def add_pixels(
+    state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
+) -> MapState:
+    """Adds the frame's measured pixels, by a kernel on CPUs and by `integrate_pixels` elsewhere."""
+    add = by_platform(cpu=_pixels_by_kernel, default=integrate_pixels)
+    return add(state, frame, max_range, drop_edges)
+
+
+def _pixels_by_kernel(
+    state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
+) -> MapState:
     factor = nan_unless_valid(frame.camera, frame.T_world_camera)
     # An unsound pose makes the range NaN, which no depth is below: the frame adds nothing.
     image = for_kernels(frame, factor * max_range, drop_edges)
     rows, mean, lost = calls.map_add(state.rows, state.mean, image, state.num_bins)
-    rows, misses = rows._replace(voxel_size=factor * rows.voxel_size), state.misses
-    if misses is not None:
-        rows, mean, misses = calls.map_miss(rows, mean, misses, image)
-    after = MapState(
+    rows = rows._replace(voxel_size=factor * rows.voxel_size)
+    return with_rows(state, rows, mean=mean, dropped=state.dropped + lost)
+
+
+def with_rows(state: MapState, rows: calls.MapRows, **changed: Array) -> MapState:
+    """Returns the map with the rows of a kernel's answer, and other fields that have changed."""
+    return replace(
+        state,
         key=rows.key,
         visited=rows.visited,
         count=rows.counts,
-        mean=mean,
         m2=rows.m2,
         resolution=rows.resolution,
         voxel_size=rows.voxel_size,
-        dropped=state.dropped + lost,
-        num_bins=state.num_bins,
-        misses=misses,
+        **changed,
     )
-    is_visible = hidden_by_none(after, frame, max_range).astype(jnp.uint8)
-    rows = calls.map_mark(after.rows, image, is_visible, state.num_bins)
-    marks = (rows.visited, rows.resolution)
-    return eqx.tree_at(lambda m: (m.visited, m.resolution), after, marks)
 
 
 def for_kernels(
