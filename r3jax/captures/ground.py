@@ -84,7 +84,7 @@ class Ground:
             )
             for mask in (np.asarray(grid.occupied), np.asarray(grid.free))
         )
-        self._is_free = np.asarray(grid.free)
+        self._grid = grid
         self._tree, self._levels, self._track = KDTree(cameras), levels, KDTree(cameras[:, :2])
         self.person = person
         """A meter of a person's size [audit units]."""
@@ -104,7 +104,8 @@ class Ground:
         for offset in self._arm_offsets():
             left = np.flatnonzero(~np.isfinite(feet[:, 0]))
             aside = places[left] + offset
-            held = self._free_at(aside) & self._free_at(places[left] + 0.5 * offset)
+            halfway = places[left] + 0.5 * offset
+            held = is_free_at(self._grid, aside) & is_free_at(self._grid, halfway)
             found = held & self._stands(aside, floor[left])
             feet[left[found]] = np.column_stack([aside[found, :2], floor[left[found]]])
         return Footing(feet, ~stands)
@@ -122,7 +123,7 @@ class Ground:
 
     def _stands(self, places: np.ndarray, floor: np.ndarray) -> np.ndarray:
         """True where a body under the camera meets nothing, [c]."""
-        shape = np.array(self._is_free.shape)
+        shape = np.array(self._grid.log_odds.shape)
         low = np.rint((floor + _SHIN * self.person - self._origin[2]) / self._cell)
         head = np.maximum(floor + _HEAD * self.person, places[:, 2])
         high = np.floor((head - self._origin[2]) / self._cell)
@@ -147,12 +148,6 @@ class Ground:
             cells += high - low
         walked = self._track.query(places[:, :2])[0] <= _SHOULDERS * self.person
         return ~meets & (walked | (free >= _FREE_SHARE * cells))
-
-    def _free_at(self, points: np.ndarray) -> np.ndarray:
-        """True where a point lies in a cell known to be free, [c]."""
-        cell = np.floor((points - self._origin) / self._cell).astype(np.int64)
-        inside = np.all((cell >= 0) & (cell < self._is_free.shape), axis=1)
-        return inside & self._is_free[tuple(np.where(inside[:, None], cell, 0).T)]
 
 
 def ground_of(
@@ -199,3 +194,14 @@ def _refined(tops: np.ndarray, voxels: np.ndarray, cameras: np.ndarray, cell: fl
         if len(height):
             found[i] = np.median(height)
     return found
+
+
+def is_free_at(grid: OccupancyGrid, places: np.ndarray) -> np.ndarray:
+    """Returns a mask of the places [c, 3] in cells known to be free, [c] bool.
+
+    Places outside of the grid are not free.
+    """
+    shape = np.array(grid.log_odds.shape)
+    cells = np.floor((places - np.asarray(grid.origin)) / float(grid.cell_size)).astype(np.int64)
+    is_inside = np.all((cells >= 0) & (cells < shape), axis=1)
+    return is_inside & np.asarray(grid.free)[tuple(np.where(is_inside[:, None], cells, 0).T)]

@@ -18,7 +18,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import Delaunay, KDTree
 
-from r3jax.captures.ground import ground_of
+from r3jax.captures.ground import ground_of, is_free_at
 from r3jax.captures.survey import MARGIN
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.mapping.occupancy import OccupancyGrid, centers_on_host
@@ -173,17 +173,6 @@ def places_on_dome(cameras: np.ndarray, center: np.ndarray, voxels: np.ndarray) 
     places = center + float(np.median(distance)) * directions
     apart, _ = KDTree(voxels).query(places)
     return places[np.asarray(apart) >= MARGIN]
-
-
-def is_free_at(grid: OccupancyGrid, places: np.ndarray) -> np.ndarray:
-    """Returns a mask of the places [c, 3] in cells known to be free, [c] bool.
-
-    Places outside of the grid are not free.
-    """
-    shape = np.array(grid.log_odds.shape)
-    cells = np.floor((places - np.asarray(grid.origin)) / float(grid.cell_size)).astype(np.int64)
-    is_inside = np.all((cells >= 0) & (cells < shape), axis=1)
-    return is_inside & np.asarray(grid.free)[tuple(np.where(is_inside[:, None], cells, 0).T)]
 
 
 def places_in_free_space(grid: OccupancyGrid, cameras: np.ndarray) -> np.ndarray:

@@ -28,7 +28,6 @@ from r3jax.files import write_atomic
 from r3jax.formats.errors import naming
 from r3jax.geometry.cameras import Camera
 from r3jax.planning.policies import HOMES, current_name
-from r3jax.planning.robot.body import Body
 from r3jax.planning.robot.motion import Motion, motion_of_record
 from r3jax.runs.header import RunError
 from r3jax.runs.reader import Run
@@ -348,13 +347,8 @@ def _check_parts(header: Submission) -> None:
     check_fields("policy", header.policy, {"name": str, "version": str})
     if header.outcome not in COMPLETE:
         raise ForeignFileError(f"`outcome` must be one of {', '.join(sorted(COMPLETE))}")
-    settings: dict[str, tuple[dict[str, Any], type]] = {
-        "exploration": (header.exploration, ExplorationConfig)
-    }
-    motion = dict(header.motion or {})
-    if isinstance(motion.get("body"), dict):
-        settings["motion.body"] = (motion.pop("body"), Body)
-    for name, (plain, kind) in (settings | {"motion": (motion, Motion)}).items():
+    settings = {"exploration": (header.exploration, ExplorationConfig)}
+    for name, (plain, kind) in (settings | {"motion": (header.motion or {}, Motion)}).items():
         hints = get_type_hints(kind)
         if unknown := sorted(plain.keys() - hints.keys()):
             raise ForeignFileError(f"`{name}` has an unknown {unknown[0]!r:.80}")

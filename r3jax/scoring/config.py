@@ -4,11 +4,11 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from r3jax.errors import InputError
 from r3jax.geometry.arguments import a_camera, a_pose, checked, one, or_none
+from r3jax.geometry.cameras import is_traced
 from r3jax.kernels.calls import Forms
 from r3jax.mapping.state import a_map
 from r3jax.visibility.config import VisibilityConfig, as_float32
@@ -46,7 +46,7 @@ class ScoringConfig(VisibilityConfig):
         if self.delta not in ("trace", "pairwise"):
             raise InputError(f"delta must be 'trace' or 'pairwise', got {self.delta!r}")
         # A traced weight has no value yet.
-        if not isinstance(self.lambda1, Tracer) and not np.isfinite(self.lambda1).all():
+        if not is_traced(self.lambda1) and not np.isfinite(self.lambda1).all():
             raise InputError(f"lambda1 (--lambda1) must be finite in float32, got {self.lambda1}")
 
 

@@ -198,6 +198,8 @@ def _is(value: Any, hint: Any) -> bool:
     if origin in (list, tuple):
         inner = args[0] if args else Any
         return isinstance(value, list) and all(_is(x, inner) for x in value)
+    if dataclasses.is_dataclass(hint):  # as an object with some of its fields
+        return _holds_fields(value, typing.get_type_hints(hint))
     if origin is dict:
         return isinstance(value, dict) and all(_is(x, args[1]) for x in value.values())
     if hint is float:
@@ -206,6 +208,12 @@ def _is(value: Any, hint: Any) -> bool:
     if hint is int:
         return isinstance(value, int) and not isinstance(value, bool)
     return isinstance(value, types.NoneType if hint is None else hint)
+
+
+def _holds_fields(value: Any, hints: Mapping[str, Any]) -> bool:
+    if not isinstance(value, dict):
+        return False
+    return all(name in hints and _is(x, hints[name]) for name, x in value.items())
 
 
 def _short(value: Any) -> str:
