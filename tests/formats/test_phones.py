@@ -213,7 +213,7 @@ def test_record3d_of_earlier_versions_has_one_camera_and_no_size_of_depth(tmp_pa
 def test_record3d_without_lzfse_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "lzfse", None)
     path = write_zip(tmp_path / "scan.r3d", {"metadata": b"{}", "rgbd/0.jpg": b""})
-    with pytest.raises(FormatError, match=r"scan\.r3d: .*pip install 'r3jax\[video\]'"):
+    with pytest.raises(FormatError, match=r"scan\.r3d: .*pip install 'r3jax\[phones\]'"):
         open_capture(path)
 
 
