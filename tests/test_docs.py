@@ -35,7 +35,7 @@ def site(tmp_path_factory):
 def test_every_public_name_is_described(site):
     """The overview links to an anchor of each name, and the anchor is there."""
     overview = (site / "api" / "index.html").read_text(encoding="utf-8")
-    links = re.findall(r'href="(\w+\.html)#(r3jax[\w.]*)"', overview)
+    links = re.findall(r'href="([\w-]+\.html)#(r3jax[\w.]*)"', overview)
     described = {anchor.rpartition(".")[2] for _, anchor in links}
     assert set(r3jax.__all__) <= described
     for page, anchor in links:
