@@ -1,4 +1,4 @@
-"""Packages that only some features need, and the extras that install them."""
+"""Optional packages, and the extras that install them."""
 
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -18,7 +18,7 @@ EXTRAS = {
 
 @contextmanager
 def naming_extras() -> Generator[None]:
-    """Names the extra to install where a package is missing.
+    """Adds the extra to install to the error of a missing package.
 
     Raises:
         ImportError: as it came, with the command that installs the package.

@@ -1,9 +1,8 @@
-"""A posed RGB-D image, from arrays of this program or of another.
+"""A posed RGB-D image, made from arrays of this or another library.
 
-Arrays of others are NumPy's, JAX's, and whatever speaks DLPack, by which PyTorch, CuPy, TensorFlow
-and others hand over memory without copying it (https://dmlc.github.io/dlpack). They are copied
-here nevertheless: a camera's driver writes the next image into the buffer of the last one, and
-JAX arrays must never change.
+Accepts arrays of NumPy and JAX, and everything that supports DLPack
+(https://dmlc.github.io/dlpack), such as tensors of PyTorch, CuPy and TensorFlow. They are always
+copied: camera drivers reuse their buffers, and JAX arrays must never change.
 
 Shape symbols: H W image size.
 """
@@ -23,7 +22,7 @@ from r3jax.geometry.cameras import Camera, is_rigid, is_traced, rigid_error
 from r3jax.geometry.voxels import check_near_origin
 
 FAR = 50.0
-"""A median depth beyond this is taken for one in another unit [m]."""
+"""A median depth beyond this is taken for a wrong unit [m]."""
 
 _MEDIAN_SIZE = 64
 """Side of the subsampled image whose median is taken [px]; it is the same to a few percent."""
@@ -37,14 +36,15 @@ CONVENTIONS: dict[str, tuple[bool, np.ndarray]] = {
         np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=np.float64),
     ),
 }
-"""Poses of other programs: whether they are inverted, and the camera's OpenCV axes in theirs."""
+"""Pose conventions: whether the pose is inverted, and the OpenCV axes in those of the
+convention."""
 
 _ON_HOST = (1, 3)
-"""DLPack's numbers of ordinary memory and of memory that CUDA has pinned."""
+"""DLPack's device types of CPU memory and of pinned CUDA memory."""
 
 
 def _as_image(image: ArrayLike) -> Array:
-    """Converts half and double precision to float32; integers stay, to be refused by name."""
+    """Converts half and double precision to float32; leaves integers, which are refused later."""
     array = jnp.asarray(image)
     # Cast to float, 8-bit colors would be 255 times too bright and millimeters too far.
     return array.astype(jnp.float32) if jnp.issubdtype(array.dtype, jnp.floating) else array
@@ -65,28 +65,28 @@ def _as_pose(pose: ArrayLike) -> Array:
 
 def _refuse_far(depth: ArrayLike) -> None:
     """Refuses depth that is surely in another unit, where it is known."""
-    # A wrong number of axes is named later, beside the shape that the camera wants.
+    # A wrong number of axes is reported later, with the camera's shape.
     if is_traced(depth) or np.ndim(depth) != 2:
         return
     array = np.asarray(depth)
     if not jnp.issubdtype(array.dtype, jnp.floating):
-        return  # refused as what it is
+        return  # refused later, with the correct reason
     # A sample is enough: millimeters taken for meters are off by 1000, not by a few percent.
     rows, columns = (max(1, size // _MEDIAN_SIZE) for size in array.shape)
     some = array[::rows, ::columns].astype(np.float64)
-    # 0 and inf are messages, not distances: an image full of either must not move the median.
+    # 0 and inf are codes, not distances: an image full of them must not shift the median.
     measured = some[(some > 0.0) & np.isfinite(some)]
-    # The median, not the maximum: a few stray pixels are no reason to refuse a frame.
+    # The median, not the maximum: a few outliers must not reject a frame.
     if len(measured) and (median := float(np.median(measured))) > FAR:
         raise InputError(
             f"the median depth is {median:.4g} m: is it in millimeters? (Frame.from_arrays: "
-            "depth_scale=0.001; transforms.json: depth_unit_scale_factor; Frame with far=True: it "
-            "is so far indeed)"
+            "depth_scale=0.001; transforms.json: depth_unit_scale_factor. If it is correct: Frame "
+            "with far=True)"
         )
 
 
 class Frame(eqx.Module):
-    """One posed RGB-D image. A frame that is malformed cannot be constructed.
+    """One posed RGB-D image; invalid ones are refused.
 
     Raises:
         ValueError: shapes that do not fit the camera, integer images (divide by 255 first),
@@ -116,10 +116,10 @@ class Frame(eqx.Module):
         *,
         far: bool = False,
     ):
-        """Takes the fields, and whether a median depth of more than 50 m is meant (`far`)."""
+        """Takes the fields; `far` allows a median depth of more than 50 m."""
         self.rgb, self.depth = _as_image(rgb), _as_image(depth)
         self.T_world_camera, self.camera = _as_pose(T_world_camera), camera
-        # The argument, not the field: what lies on the host need not come back from a device.
+        # The argument, not the field: it may still be on the host.
         if not far:
             _refuse_far(depth)
 
@@ -136,7 +136,7 @@ class Frame(eqx.Module):
         ignore: Any = None,
         far: bool = False,
     ) -> "Frame":
-        """Makes a frame from the arrays of another program.
+        """Makes a frame from arrays of any library.
 
         Arrays are NumPy's, JAX's, or anything with `__dlpack__`: a PyTorch tensor on the CPU, or
         on a device that JAX uses too. They are copied; their memory may be written again.
@@ -149,27 +149,28 @@ class Frame(eqx.Module):
                 that nothing lies within the sensor's range. Meters, or steps of `depth_scale`.
             T_world_camera: camera-to-world pose, [4, 4]; OpenCV axes (x right, y down, z
                 forward), world z up [m]; or a pose of another `convention`.
-            camera: a `Camera`, or the 3x3 matrix of a pinhole for images of this size.
-            depth_scale: meters per step of the depth, 0.001 for millimeters. None: meters, which
-                only floats can be.
-            pixel_center: where the matrix has the center of the upper left pixel [px]: 0 in
-                OpenCV and ROS, 0.5 in COLMAP and nerfstudio. A `Camera` has it at 0.5.
-            convention: what the pose means. `opencv`: camera to world, OpenCV axes, as ROS'
+            camera: a `Camera`, or the 3x3 pinhole matrix for images of this size.
+            depth_scale: meters per step of the depth, 0.001 for millimeters. None: meters; only for
+                floats.
+            pixel_center: coordinate of the upper left pixel's center in the matrix' convention
+                [px]: 0 in OpenCV and ROS, 0.5 in COLMAP and nerfstudio. A `Camera` has it at 0.5.
+            convention: the convention of the pose. `opencv`: camera to world, OpenCV axes, as ROS'
                 optical frames have them. `world-to-camera`: its inverse, as COLMAP and OpenCV's
                 `solvePnP` give it. `opengl`: camera to world, x right, y up, z back (Blender,
-                nerfstudio, ARKit). `ros`: camera to world, x ahead, y left, z up (`camera_link`,
-                `base_link`). `observe` warns where depth shows that it is another one.
-            ignore: pixels that take no part, [H, W] bool: where a detector sees a person. Their
-                depth becomes 0, no measurement, and their color is not used. None: all take part.
-            far: the median depth may exceed 50 m; otherwise that is taken for a wrong unit.
+                    nerfstudio, ARKit). `ros`: camera to world, x ahead, y left, z up
+                    (`camera_link`, `base_link`). `observe` warns if the depth images contradict it.
+            ignore: mask of pixels to leave out, [H, W] bool, for example people found by a
+                detector. Their depth becomes 0 (no measurement) and their color is not used. None:
+                use all.
+            far: allow a median depth of more than 50 m, which otherwise is taken for a wrong unit.
 
         Raises:
-            ValueError: what `Frame` refuses; colors or depth of a type or shape that cannot be
-                meant, whole numbers as depth without `depth_scale`, a matrix of other images, an
-                unknown convention, a mask of another shape or type.
-            TypeError: what is not an array, or cannot be handed over.
+            ValueError: as `Frame`; colors or depth of an unexpected type or shape, integer depth
+                without `depth_scale`, a matrix that does not fit the images, an unknown convention,
+                a mask of another shape or type.
+            TypeError: not an array, or one that cannot be converted.
         """
-        # Colors come first: a bare matrix of intrinsics has no image size of its own.
+        # Colors first: they give the image size, which a matrix of intrinsics lacks. # words: ok
         colors = color_image(rgb)
         height, width = colors.shape[:2]
         own_depth = depth_image(depth, depth_scale)
@@ -186,7 +187,7 @@ class Frame(eqx.Module):
         )
 
     def __check_init__(self) -> None:
-        """Refuses what would become a NaN or a silent error later."""
+        """Refuses values that would cause NaN or silent errors later."""
         # Shapes are known while tracing; values are not.
         self._check_structure()
         if not is_traced(self.rgb, self.depth, self.T_world_camera):
@@ -206,7 +207,7 @@ class Frame(eqx.Module):
             raise InputError(
                 f"T_world_camera is a 4x4 matrix, got shape {self.T_world_camera.shape}"
             )
-        # Nothing is converted here: what an integer stands for, only the caller knows.
+        # No conversion here: only the caller knows the unit of an integer.
         for name, array in (("rgb", self.rgb), ("depth", self.depth)):
             if not jnp.issubdtype(array.dtype, jnp.floating):
                 raise InputError(
@@ -215,12 +216,12 @@ class Frame(eqx.Module):
                 )
 
     def _check_values(self) -> None:
-        # NumPy: reading a recording of many image sizes must not compile a program for each.
+        # NumPy: JAX would compile a program for each image size of a recording.
         rgb, depth = np.asarray(self.rgb), np.asarray(self.depth)
         low, high = float(rgb.min()), float(rgb.max())  # NaN makes the comparison false
         if not (low >= 0.0 and high <= 1.0):
             raise InputError(f"rgb must lie in [0, 1], got values from {low:.4g} to {high:.4g}")
-        # Written as what must hold: NaN fails it, while `< 0` would let NaN pass.
+        # Written as a condition that NaN fails; `< 0` would let NaN pass.
         if not float(depth.min()) >= 0.0:
             bad = np.argwhere(~(depth >= 0.0))
             row, column = (int(i) for i in bad[0])
@@ -243,19 +244,19 @@ a_frame = one(Frame, "Frame.from_arrays makes one of arrays", leaf="depth", ndim
 
 
 def as_array(name: str, value: Any) -> np.ndarray | Array:
-    """Converts a known kind of array, to NumPy's if it lies in ordinary memory.
+    """Converts any supported kind of array; to a NumPy array if it is in CPU memory.
 
     Args:
-        name: what the caller calls it, for errors.
+        name: the caller's name of it, for errors.
         value: an array of NumPy or JAX, anything with `__dlpack__` or `__array__`, or numbers in
-            lists. What lies on a device stays there, and JAX must know the device.
+            lists. Arrays on a device stay there; JAX must support the device.
 
     Returns:
-        NumPy's array, whose memory may be the caller's; JAX's own one for JAX's arrays (under
-        jit too) and for arrays on a device.
+        A NumPy array, which may share the caller's memory; a JAX array for JAX arrays (also under
+        jit) and for arrays on a device.
 
     Raises:
-        TypeError: nothing of the kind, or an array that cannot be handed over.
+        TypeError: not an array, or one that cannot be converted.
     """
     if isinstance(value, jax.Array | np.ndarray):
         return value
@@ -280,8 +281,8 @@ def _from_dlpack(name: str, value: Any) -> np.ndarray | Array:
         return jax.dlpack.from_dlpack(value, copy=True)
     except Exception as error:  # every library refuses in its own way: gradients, devices, types
         raise TypeError(
-            f"{name}: the {type(value).__name__} cannot be taken over by DLPack ({error}); hand "
-            "over a NumPy array instead, of a PyTorch tensor: tensor.detach().cpu().numpy()"
+            f"{name}: cannot convert the {type(value).__name__} by DLPack ({error}); "
+            "pass a NumPy array instead (PyTorch: tensor.detach().cpu().numpy())"
         ) from error
 
 
@@ -308,13 +309,13 @@ def color_image(rgb: Any) -> Float[Array, "H W 3"]:
 
 
 def _hint(shape: tuple[int, ...]) -> str:
-    """Suggests how to mend the shapes that other libraries prefer."""
+    """Suggests how to convert the shapes that other libraries use."""
     if len(shape) == 3 and shape[2] == 4:
-        return ": leave out alpha, rgb[..., :3]"
+        return ": drop the alpha channel, rgb[..., :3]"
     if len(shape) == 3 and shape[0] == 3:
-        return ": channels come last here, transpose it by (1, 2, 0)"
+        return ": the channels must come last, transpose it by (1, 2, 0)"
     if len(shape) == 4 and shape[0] == 1:
-        return ": leave out the axis of the batch"
+        return ": drop the batch axis"
     return ""
 
 
@@ -322,7 +323,7 @@ def depth_image(depth: Any, metres_per_step: float | int | None = None) -> Float
     """Returns z-depth [m] from meters, or from steps of `metres_per_step`.
 
     Raises:
-        ValueError: whole numbers without a unit, a unit that cannot be one, no numbers.
+        ValueError: integers without a unit, an invalid unit, not numbers.
         TypeError: not an array.
     """
     array = as_array("depth", depth)
@@ -332,14 +333,14 @@ def depth_image(depth: Any, metres_per_step: float | int | None = None) -> Float
     if metres_per_step is None:
         if is_whole:
             raise InputError(
-                f"depth is {array.dtype}: say how many meters one step is, depth_scale=0.001 for "
+                f"depth is {array.dtype}: give the meters per step, depth_scale=0.001 for "
                 "millimeters"
             )
         return jnp.asarray(_float32(array))
     scale = float(metres_per_step)
     if not 0.0 < scale < np.inf or (is_whole and scale >= 1.0):
         raise InputError(
-            "depth_scale is how many meters one step of the depth is, such as 0.001 for "
+            "depth_scale must be the meters per step of the depth, such as 0.001 for "
             f"millimeters, got {scale:g}"
         )
     if isinstance(array, np.ndarray):
@@ -357,7 +358,7 @@ def pinhole_camera(camera: Any, height: int, width: int, pixel_center: float | i
         pixel_center: where the matrix has the center of the upper left pixel [px].
 
     Raises:
-        ValueError: a matrix that is not such a one, or one of other images.
+        ValueError: not a matrix of intrinsics, or one that does not fit the images.
         TypeError: not an array.
     """
     if isinstance(camera, Camera):
@@ -378,7 +379,7 @@ def pinhole_camera(camera: Any, height: int, width: int, pixel_center: float | i
     if not (0.0 <= column <= width and 0.0 <= row <= height):
         raise InputError(
             f"the principal point ({cx:g}, {cy:g}) lies outside the {width}x{height} images: is "
-            "the matrix for another resolution? (Of cropped images give an r3jax.Camera)"
+            "the matrix for another resolution? (For cropped images pass an r3jax.Camera)"
         )
     return Camera(width, height, fx, fy, column, row)
 
@@ -407,7 +408,8 @@ def to_camera_to_world(pose: Any, convention: str) -> Any:
     """Converts a pose to camera-to-world in OpenCV axes.
 
     Args:
-        pose: a matrix [4, 4], NumPy's or JAX's; of another shape it stays as it is, to be refused.
+        pose: a matrix [4, 4], NumPy's or JAX's; other shapes are returned unchanged, and refused
+            later.
         convention: one of `CONVENTIONS`.
 
     Raises:
@@ -420,7 +422,7 @@ def to_camera_to_world(pose: Any, convention: str) -> Any:
         return pose
     if not is_inverted:
         return pose @ axes.astype(pose.dtype)
-    # The transpose, not a solver: a matrix that is not rigid stays so, and is refused as such.
+    # The transpose, not a solver: a matrix that is not rigid stays so, and is refused later.
     R, library = pose[:3, :3].T, jnp if isinstance(pose, jax.Array) else np
     shift = -(R @ pose[:3, 3])
     top = library.concatenate([R, shift[:, None]], axis=1)
@@ -428,7 +430,7 @@ def to_camera_to_world(pose: Any, convention: str) -> Any:
 
 
 def own_matrix(name: str, value: Any) -> np.ndarray | Array:
-    """Copies a small matrix, so that its memory is not the caller's.
+    """Copies a small matrix.
 
     Raises:
         TypeError: not an array.

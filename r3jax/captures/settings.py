@@ -1,4 +1,4 @@
-"""Settings of how a capture is surveyed, options of commands, too. Its import is light."""
+"""Settings for reading and mapping a capture; also options of commands. Imports nothing heavy."""
 
 import math
 from dataclasses import dataclass
@@ -8,53 +8,54 @@ from typing import Literal
 from r3jax.errors import InputError
 
 Surfaces = Literal["auto", "depth", "sweep", "model", "points"]
-"""Where surfaces may come from: see `captures.surfaces`."""
+"""Sources of depth; see `captures.surfaces`."""
 
 
 @dataclass(frozen=True)
 class SurveySettings:
-    """How a capture is read and how fine it is mapped.
+    """How a capture is read, and at which resolution it is mapped.
 
     Raises:
         ValueError: a setting that makes no sense; names the option.
     """
 
     voxel_size: float | None = None
-    """Voxel size in the capture's units; by default 5 cm, or from the depths."""
+    """Voxel size in the capture's units; by default 5 cm, or derived from the depths if the scale
+    is unknown."""
 
     max_range: float | None = None
-    """Surfaces farther from a camera count as invisible, in the capture's units; by default 5 m,
-    or from the depths."""
+    """Range of the sensor in the capture's units; farther surfaces are ignored. By default 5 m, or
+    derived from the depths if the scale is unknown."""
 
     up: str | None = None
-    """Direction of the capture that points up: x, y, z, -x, -y or -z (`--up=-y`), or three numbers
-    (`--up=0.1,-0.9,0.4`). By default as the format says, or a guess from floors, walls and how the
-    cameras were held."""
+    """Up direction in the capture's coordinates: x, y, z, -x, -y or -z (`--up=-y`), or three
+    numbers (`--up=0.1,-0.9,0.4`). By default that of the format, or estimated from floors, walls
+    and the cameras' orientation."""
 
     max_frames: int = 400
-    """Images to use at most, evenly spread."""
+    """Maximum number of images to use, evenly spread over the capture."""
 
     depth_scale: float = 1.0
-    """Multiply all depths of depth images, where their unit is not the one that was read."""
+    """Factor for all depth images, if their unit was misinterpreted."""
 
     depth_along_ray: bool = False
-    """Depth images hold the distance along each pixel's ray, as those of Hypersim and SceneNet do,
-    and not z: convert it."""
+    """Depth images contain distances along each pixel's ray (as in Hypersim and SceneNet) instead
+    of z: convert them."""
 
     surfaces: Surfaces = "auto"
-    """Where depth comes from: depth images (`depth`), a comparison of the photos (`sweep`), a
-    trained splat (`model`, with --model) or the sparse points alone (`points`). By default the best
-    that the capture has."""
+    """Source of depth: depth images (`depth`), multi-view stereo by plane sweep (`sweep`), a
+    trained splat (`model`, with --model) or sparse points only (`points`). By default the best
+    source that the capture has."""
 
     model: Path | None = None
     """Trained splat (.ply of gsplat, nerfstudio, INRIA's 3DGS, Brush or Postshot) in the capture's
-    coordinates: its depth is taken as the surfaces."""
+    coordinates; depth is rendered from it."""
 
     trust_depth: bool = False
-    """Take the depth images as they are, even if they contradict the poses or each other."""
+    """Use the depth images even if they contradict the poses or each other."""
 
     def __post_init__(self) -> None:
-        """Refuses what makes no sense."""
+        """Refuses invalid or contradictory settings."""
         for name in ("voxel_size", "max_range"):
             value = getattr(self, name)
             if value is not None and not 0.0 < value < math.inf:
@@ -67,7 +68,7 @@ class SurveySettings:
 
 
 def at_least(settings: object, least: dict[str, int]) -> None:
-    """Refuses settings below their least values.
+    """Refuses settings below their minimum.
 
     Raises:
         ValueError: names the option.

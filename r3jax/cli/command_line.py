@@ -65,7 +65,7 @@ def run_command(args: Sequence[str]) -> int:
     """
     words = list(args)
     if odd := [word for word in words if "\0" in word]:
-        raise InputError(f"{odd[0]!r} holds a null byte, which no name and no path can")
+        raise InputError(f"{odd[0]!r} contains a null byte, which names and paths cannot")
     if words == ["--version"]:
         print(f"r3jax {r3jax.__version__}")
         return 0
@@ -82,7 +82,7 @@ def run_command(args: Sequence[str]) -> int:
 
 
 def find_command(name: str) -> Callable[[Any], int]:
-    """Imports what runs a command."""
+    """Imports the function that runs a command."""
     home = COMMANDS[name].__module__.replace(".options.", ".commands.")
     return getattr(importlib.import_module(home), f"run_{name}")
 

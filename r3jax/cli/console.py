@@ -1,7 +1,7 @@
 """How the commands print: safe text, tables, and progress on a terminal or in a log.
 
 Only this module imports rich, whose own classes read square brackets in any string as markup. All
-long loops report here between their steps, which is where a Ctrl-C that got lost is obeyed.
+long loops report here between their steps, where a pending Ctrl-C is handled.
 """
 
 import shlex
@@ -41,7 +41,7 @@ __all__ = [
 
 
 class Console(rich.console.Console):
-    """A terminal or a log that takes every string as it is; styled text is a `Text`."""
+    """A terminal or a log that prints every string literally; styled text is a `Text`."""
 
     def __init__(self, **settings: Any):
         """Takes rich's settings, of which `stderr=True` is the one that matters."""
@@ -68,7 +68,7 @@ class _Status(Status):
     """A spinner; rich would read its line as markup."""
 
     def update(self, status: rich.console.RenderableType | None = None, **settings: Any) -> None:
-        """Replaces the line; a Ctrl-C that got lost is obeyed."""
+        """Replaces the line, and handles a pending Ctrl-C."""
         check_interrupt()
         super().update(None if status is None else _as_it_is(status), **settings)
 
@@ -78,7 +78,7 @@ def _as_it_is(what: rich.console.RenderableType) -> rich.console.RenderableType:
 
 
 class TextColumn(rich.progress.TextColumn):
-    """What a bar says of its task, as it is."""
+    """A column of a bar that prints its text literally."""
 
     def __init__(self, text_format: str, style: str = "none"):
         """Takes a format over `task` and one style for all of it."""
@@ -125,7 +125,7 @@ class Bar:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Takes the bar down."""
+        """Removes the bar."""
         self._bar.stop()
 
 

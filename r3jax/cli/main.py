@@ -1,4 +1,4 @@
-"""The entry of the command line: Ctrl-C first, then what a command needs."""
+"""The entry point of the command line: handles Ctrl-C before a command's imports begin."""
 
 import os
 import sys
@@ -20,19 +20,19 @@ USER_ERROR = 2
 """Exit code of wrong input: an unknown name, a folder that exists, a broken file."""
 
 NO_READER = 141
-"""Exit code where the reader of the output has gone (`r3jax info | head`), as shells have it."""
+"""Exit code when the reader of the output is gone (`r3jax info | head`), as in shells."""
 
 
 BUG = 1
-"""Exit code where the fault is in r3jax, or in a policy of the user's: the traceback is printed."""
+"""Exit code of a bug in r3jax or in the user's policy; the traceback is printed."""
 
 _MENDABLE = (InputError, OSError, ImportError)
 """Errors printed as one line: wrong input, a broken file, a full disk, a missing package."""
 
 
 _REPORT = """
-r3jax: this is a bug in r3jax, or in a policy or program that it was given. Please report it to the
-maintainers with the lines above, the command and the output of `r3jax info`."""
+r3jax: this is a bug in r3jax, or in a policy or program that you gave it. Please report it with the
+lines above, the command and the output of `r3jax info`."""
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -79,7 +79,7 @@ def _main(args: Sequence[str] | None) -> int:
 
 
 def _interrupted(error: BaseException) -> int:
-    """Says how to go on, if the command knows it."""
+    """Prints how to resume, if the command supports it."""
     settle_interrupt()
     how = str(error) if isinstance(error, KeyboardInterrupt) else ""
     how = printable(how) or "what was recorded before is complete"

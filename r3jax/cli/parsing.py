@@ -33,7 +33,7 @@ _DIGITS = 30
 
 
 class _Refused(Exception):
-    """A refusal on its path through tyro, which prints a usage message for every ValueError."""
+    """Carries a refusal through tyro, which would print a usage message for a ValueError."""
 
 
 def parse(commands: Mapping[str, type], words: Sequence[str], description: str) -> Any:
@@ -216,14 +216,14 @@ def whole_number(text: str) -> int:
         value = Decimal("nan")
     if value.is_finite() and value.adjusted() < _DIGITS and int(value) == value:
         return int(value)
-    raise InputError(f"it takes one whole number, such as 512 or 1e5, got {text!r}")
+    raise InputError(f"expects one whole number, such as 512 or 1e5, got {text!r}")
 
 
 def _number(text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise InputError(f"it takes one number, such as 0.05, got {text!r}") from None
+        raise InputError(f"expects one number, such as 0.05, got {text!r}") from None
 
 
 _READERS: dict[Any, Callable[[str], int | float]] = {int: whole_number, float: _number}

@@ -1,4 +1,4 @@
-"""Settings of the loop and its budget. Plain numbers: they go into run.json as they are."""
+"""Settings of the loop and its budget: plain numbers, which run.json stores."""
 
 import math
 from dataclasses import dataclass
@@ -17,10 +17,11 @@ RETIRED_GAZES = {
     "blend": "it lost 1.8 dB against panorama; commit fb13156 has it",
     "planned": "it lost 0.7 dB against panorama; commit fb13156 has it",
 }
-"""Gazes that recorded runs may name: the reason, and where their code is."""
+"""Removed gazes that recorded runs may name: why they were removed, and the commit with their
+code."""
 
 LEAST_PIECE = 0.05
-"""Least distance between frames that are captured while moving [m]: the edge of a voxel."""
+"""Minimum distance between frames captured while moving [m]: one voxel."""
 
 DEPTH_STEPS_PER_METRE = 5000
 """Recorded depth is in steps of 0.2 mm (TUM's scale)."""
@@ -30,17 +31,17 @@ BEYOND_RANGE = 65535
 
 # One step less: the largest stored value means "beyond the range", not a depth.
 LARGEST_DEPTH = (BEYOND_RANGE - 1) / DEPTH_STEPS_PER_METRE
-"""What lies farther is recorded as beyond the range [m]."""
+"""Largest depth that a depth image can store [m]; larger ones are recorded as beyond the range."""
 
 Unit = Literal["views", "frames", "seconds", "metres"]
 
 
 @dataclass(frozen=True)
 class Budget:
-    """How long a run may last.
+    """The budget of a run.
 
-    Views are those that a policy chose, and the one at the start; frames count those captured
-    while moving, too. Without captures they are the same. Seconds are those of the mission clock.
+    Views are the initial one and those that the policy chose. Frames also include those captured
+    while moving. Seconds are on the mission clock.
     """
 
     unit: Unit
@@ -106,7 +107,7 @@ def parse_budget(text: str) -> Budget:
 
 
 def check_voxel_size(voxel_size: float, max_range: float) -> None:
-    """Refuses voxels so large that a map of them tells nothing.
+    """Refuses voxels too large for a useful map.
 
     Args:
         voxel_size: edge of a voxel [m].
@@ -124,62 +125,62 @@ def check_voxel_size(voxel_size: float, max_range: float) -> None:
 
 @dataclass(frozen=True)
 class ExplorationConfig(MappingConfig):
-    """What the loop itself decides, mapping included; the policy has its own settings."""
+    """Settings of the loop, mapping included; the policy has its own settings."""
 
     remove_moved: bool = False
-    """Remove voxels that frames see through. Off, as in every run recorded before there was such
-    a setting: nothing moves in the worlds of a simulator."""
+    """Remove voxels that later frames see through. Off by default: nothing moves in simulated
+    scenes, and earlier recorded runs were made without it."""
 
     speed: float = 1.0
-    """Flight speed [m/s] where the policy's motion has none; turning takes no time then."""
+    """Speed [m/s] if the policy's motion sets none; turning then takes no time."""
 
     clock: ClockName = "wall"
-    """`wall`: measured planning and mapping, plus flight. `model`: fixed costs, repeatable."""
+    """Mission clock. `wall`: measured planning and mapping time plus travel time. `model`: fixed
+    costs plus travel time, repeatable."""
 
     planning_seconds: float = 0.3
-    """What the clock `model` charges for a decision [s]."""
+    """Cost of a decision on the clock `model` [s]."""
 
     mapping_seconds: float = 0.02
-    """What the clock `model` charges for a frame that the policy takes in [s]."""
+    """Cost of mapping a frame on the clock `model` [s]."""
 
     num_probes: int = 16
-    """Views that mean renderability is averaged over."""
+    """Number of random views over which mean renderability is averaged."""
 
     checkpoint_every: int = 1
-    """Views between two stored states of the loop; the last one is always stored."""
+    """Views between two checkpoints; the last view always has one."""
 
     max_still_views: int = 100
-    """Views in a row without moving that end the run: the policy is stuck."""
+    """End the run after this number of views in a row without moving: the policy is stuck."""
 
     until: str | None = None
-    """Stop before the budget is spent, when the forecast of the image quality says that the views
-    are enough: `psnr:25` for the mean of all free-space views, `psnr:20@p10` for all but the worst
-    tenth."""
+    """Stop early when the predicted image quality reaches a goal: `psnr:25` for a mean of 25 dB
+    over all free-space views, `psnr:20@p10` for at least 20 dB in 90 % of them."""
 
     until_every: int = 5
-    """Views between two forecasts; each takes most of a second."""
+    """Views between two forecasts, each of which takes almost a second."""
 
     capture_every: float | None = None
     """Capture frames while moving from view to view, at most this far apart [m]; by default
     none."""
 
     capture_rate: float | None = None
-    """As --capture-every, by frame rate [Hz]: at speed v frames are at most v / rate apart. No
-    frames while turning in place."""
+    """As --capture-every, by frame rate [Hz]: frames are at most speed / rate apart. No frames are
+    captured while turning in place."""
 
     gaze: str = "panorama"
     """Where the camera points while moving: `ahead`: along the path; `panorama`: at each place in
     the direction of highest utility."""
 
     exposure: float = 0.0
-    """Exposure time of a frame captured while moving [s]; 0: turning blurs nothing."""
+    """Exposure time of frames captured while moving [s]; 0: no motion blur."""
 
     blur: float = 1.0
     """Maximum motion blur from rotation [px]."""
 
     plan_while_moving: bool = False
-    """Decide on the next view during the flight, on the map as it will be, and only reconsider on
-    arrival: the clock is charged for what the flight does not hide."""
+    """Choose the next view while moving, on the predicted map, and only re-evaluate it on arrival.
+    The clock is charged only for planning that outlasts the move."""
 
     @property
     def captures(self) -> bool:
@@ -196,11 +197,10 @@ class ExplorationConfig(MappingConfig):
         return math.inf if self.capture_every is None else self.capture_every
 
     def check_scales(self) -> None:
-        """Refuses lengths that do not fit together; what was recorded with them is still read.
+        """Refuses lengths that do not fit together; recorded runs that have them still open.
 
         Raises:
-            ValueError: a range beyond what depth images can hold, or voxels so large that a map of
-                them tells nothing.
+            ValueError: a range beyond what depth images can hold, or voxels too large for it.
         """
         if self.max_range > LARGEST_DEPTH:
             raise InputError(
@@ -210,7 +210,7 @@ class ExplorationConfig(MappingConfig):
         check_voxel_size(self.voxel_size, self.max_range)
 
     def __post_init__(self) -> None:
-        """Refuses what cannot work."""
+        """Refuses invalid settings."""
         super().__post_init__()
         # Written so that NaN fails, too: it would make every flight time and the clock NaN.
         if not LEAST_RATE <= self.speed < math.inf:
@@ -231,7 +231,7 @@ class ExplorationConfig(MappingConfig):
         self._check_captures()
 
     def _check_captures(self) -> None:
-        """Refuses captures that cannot work."""
+        """Refuses invalid settings of frames captured while moving."""
         every, rate = self.capture_every, self.capture_rate
         if every is not None and rate is not None:
             raise InputError("give capture_every or capture_rate, not both")

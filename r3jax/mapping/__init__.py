@@ -1,1 +1,1 @@
-"""What has been seen: the hashed voxel map and the coarse occupancy grid."""
+"""The hashed voxel map and the coarse occupancy grid."""

@@ -1,8 +1,8 @@
-"""Pixels -> voxels: the points of one frame grouped by the voxel that holds them.
+"""Groups the points of one frame by voxel.
 
-Thousands of pixels share a voxel. Instead of sorting their keys (8 ms for 512x512 pixels on a
-CPU) each pixel writes its number into a scratch table with `max`; the pixel that stays speaks
-for its voxel.
+Many pixels share a voxel. Instead of sorting their keys (8 ms for 512x512 pixels on a CPU), each
+pixel writes its number into a scratch table with `max`; the remaining one is the leader of its
+voxel.
 
 Shape symbols: P points of the frame; S scratch slots; H W image size.
 """
@@ -20,8 +20,8 @@ from r3jax.kernels.constants import FAR, STRAY, THIN
 from r3jax.mapping.table import hash_key
 
 _SCRATCH_BITS = (7, 7, 6)
-"""Scratch slots along x, y and z as powers of two: 6.4 x 6.4 x 3.2 m at 5 cm. Inside such a box
-no two voxels share a slot; larger frames need further rounds with a hash."""
+"""Scratch slots along x, y and z as powers of two: 6.4 x 6.4 x 3.2 m at 5 cm. Inside such a box no
+two voxels share a slot; larger frames need further rounds that use a hash."""
 
 
 _Election = tuple[UInt32[Array, ""], Int[Array, " P"], Bool[Array, " P"]]
@@ -29,19 +29,19 @@ _Election = tuple[UInt32[Array, ""], Int[Array, " P"], Bool[Array, " P"]]
 
 
 class Groups(eqx.Module):
-    """Points grouped by voxel. Point `i` with `is_leader[i]` stands for a voxel."""
+    """Points grouped by voxel. Each point `i` with `is_leader[i]` represents a voxel."""
 
     key: UInt32[Array, "2 P"]
     """Packed key of each point's voxel."""
 
     leader: Int[Array, " P"]
-    """The point that stands for each point's voxel; P for points that take no part."""
+    """The leader of each point's voxel; P for ignored points."""
 
     is_leader: Bool[Array, " P"]
     """True for one point of each touched voxel."""
 
     rgb_sum: Float[Array, "P 4"]
-    """Sum of the colors of the voxel's points, and their number; at leaders only."""
+    """Sum of the colors of the voxel's points, and their number; only at leaders."""
 
 
 def group_by_voxel(
@@ -50,7 +50,7 @@ def group_by_voxel(
     valid: Bool[Array, " P"],
     voxel_size: Float[Array, ""],
 ) -> Groups:
-    """Groups points by voxel and averages their colors, so that texture is not noise.
+    """Groups points by voxel and averages their colors, so that texture does not count as noise.
 
     Args:
         points_world: points [m].
@@ -64,15 +64,15 @@ def group_by_voxel(
     num = points_world.shape[1]
     # A fourth channel of ones counts the points in the same pass.
     rows = jnp.concatenate([rgb, jnp.ones((num, 1), dtype=rgb.dtype)], axis=1)
-    # One scatter of rows of four is as quick as a scatter of scalars.
+    # One scatter of rows of four is as fast as a scatter of scalars.
     sums = jnp.zeros((num, 4), dtype=rgb.dtype).at[leader].add(rows, mode="drop")
     is_leader = leader == jnp.arange(num, dtype=jnp.int32)
     return Groups(key=jnp.stack([low, high]), leader=leader, is_leader=is_leader, rgb_sum=sums)
 
 
 def group_means(groups: Groups, values: Float[Array, "P k"]) -> Float[Array, "P k"]:
-    """Averages values over the points of each voxel: at the leaders, elsewhere 0."""
-    # The points take the places of their leaders; those that take no part have leader P, dropped.
+    """Averages values over the points of each voxel; 0 except at leaders."""
+    # Points write to their leaders; ignored points have leader P, which is dropped.
     sums = jnp.zeros_like(values).at[groups.leader].add(values, mode="drop")
     return sums / jnp.maximum(groups.rgb_sum[:, 3:], 1.0)
 
@@ -80,7 +80,7 @@ def group_means(groups: Groups, values: Float[Array, "P k"]) -> Float[Array, "P 
 def points_of_pixels(frame: Frame, depth: Float[Array, "H W"]) -> Float[Array, "3 P"]:
     """Computes the points of all pixels in the world [m], row by row, coordinates first.
 
-    The long axis last keeps the arithmetic in one vectorized loop; [H, W, 3] takes 3 ms more.
+    With the long axis last the arithmetic is one vectorized loop; [H, W, 3] takes 3 ms more.
     """
     camera, T = frame.camera, frame.T_world_camera
     u = (jnp.arange(camera.width, dtype=jnp.float32) + 0.5 - camera.cx) / camera.fx
@@ -91,7 +91,7 @@ def points_of_pixels(frame: Frame, depth: Float[Array, "H W"]) -> Float[Array, "
 
 
 def _torus_slot(x: Int[Array, " P"], y: Int[Array, " P"], z: Int[Array, " P"]) -> Int[Array, " P"]:
-    # Low bits, not a hash: neighbors never collide, so one round settles a frame of room size.
+    # Low bits, not a hash: neighbors never collide, so that one round suffices in a room.
     bx, by, bz = _SCRATCH_BITS
     low_bits: Callable[[Array, int], Array] = lambda value, bits: value & ((1 << bits) - 1)
     return low_bits(x, bx) | (low_bits(y, by) << bx) | (low_bits(z, bz) << (bx + by))
@@ -112,11 +112,11 @@ def _leaders(
         slot: Int[Array, " P"], leader: Int[Array, " P"], waiting: Bool[Array, " P"]
     ) -> tuple[Int[Array, " P"], Bool[Array, " P"]]:
         scratch = jnp.full(num_slots, -1, dtype=jnp.int32)
-        # `max` commutes: who leads does not depend on the order of the scatter.
+        # `max` commutes: the result does not depend on the order of the scatter.
         scratch = scratch.at[jnp.where(waiting, slot, num_slots)].max(point, mode="drop")
-        # Slots without a waiting point hold -1, which would read from the end.
+        # Empty slots hold -1, which would index from the end.
         elected = jnp.maximum(scratch[slot], 0)
-        # Voxels may share a slot: only points with the winner's very key follow it.
+        # Voxels may share a slot: only points with the winner's key follow it.
         agrees = waiting & (low[elected] == low) & (high[elected] == high)
         return jnp.where(agrees, elected, leader), waiting & ~agrees
 
@@ -136,29 +136,29 @@ def _leaders(
 def edge_pixels(depth: Float[Array, "H W"], voxel_size: Float[Array, ""]) -> Bool[Array, "H W"]:
     """Finds pixels on depth edges, whose color mixes foreground and background.
 
-    An edge is a step of more than a voxel between neighbors that is no slope: the pixel also
-    strays by more than a voxel from where its neighbors on both sides say that a plane runs. A
-    plane is linear in inverse depth, so a floor or a ceiling seen at a grazing angle, whose depth
-    changes by many voxels a pixel, has no edges.
+    An edge is a step of more than a voxel between neighbors that is not a slope: the pixel also
+    deviates by more than a voxel from the plane through its neighbors on both sides. A plane is
+    linear in inverse depth, so a floor or a ceiling seen at a grazing angle, whose depth changes by
+    many voxels a pixel, has no edges.
 
-    Raw depth of a noisy sensor steps by more than a voxel everywhere beyond 3 m (1 % of the
-    depth is 4 cm at 4 m), which would empty the far half of every frame; so the test runs on the
-    3x3 median, which keeps steps and calms noise, and adds the pixels that stray from it.
-    Pixels without a measurement do not count as neighbors: beside a hole the other neighbor's
-    depth is compared.
+    Raw depth of a noisy sensor steps by more than a voxel everywhere beyond 3 m (1 % of the depth
+    is 4 cm at 4 m), which would empty the far half of every frame; so the test runs on the 3x3
+    median, which keeps steps and removes noise, and adds the pixels that deviate from it. Pixels
+    without a measurement do not count as neighbors: beside a hole only the other neighbor is
+    compared.
 
     Args:
         depth: z-depth [m]; 0 no measurement, inf beyond range.
         voxel_size: edge of a voxel [m].
     """
-    # What is no measurement is a hole, whatever it is.
+    # Everything but a measurement is a hole.
     capped = jnp.where(depth > 0.0, jnp.minimum(depth, FAR), 0.0)
     around = _neighborhood(capped)
     # Holes take the value of the pixel in the middle.
     median = _median9([jnp.where(value > 0.0, value, capped) for value in around])
     is_edge = jnp.abs(capped - median) > voxel_size + STRAY * capped
     is_edge |= _breaks(median, _neighborhood(median), voxel_size)
-    # What noise of 1 % cannot explain is an edge whatever the median says: thin parts.
+    # Deviations beyond 1 % noise are edges whatever the median: thin structures.
     is_edge |= _breaks(capped, around, voxel_size + THIN * capped)
     return (depth > 0.0) & is_edge
 
@@ -182,7 +182,7 @@ def _breaks(
 
 
 def _neighborhood(image: Float[Array, "H W"]) -> list[Float[Array, "H W"]]:
-    """Shifts the image to the 3x3 neighbors of every pixel; the border repeats its pixels."""
+    """Stacks the 3x3 neighbors of every pixel; the border is repeated."""
     height, width = image.shape
     padded = jnp.pad(image, 1, mode="edge")
     return [padded[i : i + height, j : j + width] for i in range(3) for j in range(3)]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from r3jax.errors import InputError
 
 MAX_CAPACITY = 1 << 27
-"""Rows of a map: 5 GB."""
+"""Maximum number of rows of a map (5 GB)."""
 
 
 @dataclass(frozen=True)
@@ -18,38 +18,39 @@ class MappingConfig:
     """
 
     voxel_size: float = 0.05
-    """Edge of a voxel of the map [m]."""
+    """Voxel size [m]."""
 
     num_bins: int = 64
     """Direction bins per voxel."""
 
     capacity: int = 1 << 17
-    """Rows of the map at the start, a power of two."""
+    """Initial number of rows of the map, a power of two."""
 
     allow_growth: bool = True
-    """Double the table before it is 70 % full. If not, what finds no row is counted."""
+    """Double the table before it is 70 % full. If False, voxels beyond its capacity are dropped and
+    counted."""
 
     drop_edges: bool = True
-    """Keep pixels on depth edges, whose color mixes two surfaces, out of the map."""
+    """Ignore pixels on depth edges, whose color mixes two surfaces."""
 
     remove_moved: bool = True
-    """Remove voxels that frames see through, such as a person who has walked on, and stray
-    measurements: one byte a row."""
+    """Remove voxels that later frames see through, such as a person who has moved on, or stray
+    measurements. Takes one byte per row."""
 
     cell_size: float = 0.2
-    """Edge of a cell of the coarse grid [m]."""
+    """Cell size of the coarse occupancy grid [m]."""
 
     max_range: float = 5.0
     """Range of the depth sensor [m]."""
 
     body_radius: float = 0.3
-    """Where the camera has been, this ball is free [m]."""
+    """Radius of the ball around each camera position that counts as free [m]."""
 
     start_radius: float = 0.5
-    """The ball round the start that the operator vouches for [m]."""
+    """Radius of the ball around the start that is assumed to be free [m]."""
 
     def __post_init__(self) -> None:
-        """Refuses what cannot work."""
+        """Refuses invalid settings."""
         for name in ("voxel_size", "cell_size", "max_range"):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise InputError(f"{name} must be positive, got {getattr(self, name)}")

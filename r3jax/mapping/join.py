@@ -1,6 +1,6 @@
-"""Statistics per voxel join the map: bins unite, moments add up, the best resolution wins.
+"""Joins statistics per voxel into the map: unites bins, adds moments, keeps the best resolution.
 
-A frame, another map, a smaller table: all are statistics per voxel, and one rule merges them.
+A frame, another map and a smaller table are all statistics per voxel, merged by one rule.
 
 Shape symbols: N capacity; M rows of new statistics; W words of bins.
 """
@@ -21,7 +21,7 @@ from r3jax.mapping.table import find_or_insert
 
 
 class Statistics(eqx.Module):
-    """What is known of some voxels, each at most once: to be joined into a map."""
+    """Statistics of some distinct voxels, to be joined into a map."""
 
     key: UInt32[Array, "2 M"]
     """Packed voxel index."""
@@ -45,7 +45,7 @@ class Statistics(eqx.Module):
     """Best resolution [px/m]."""
 
     misses: UInt8[Array, " M"] | None = None
-    """Looks through each voxel; None: none, as of an observation."""
+    """Number of frames that saw through each voxel; None for observations."""
 
 
 Moments = tuple[Float[Array, " M"], Float[Array, "3 M"], Float[Array, " M"]]
@@ -65,7 +65,7 @@ def combine_moments(a: Moments, b: Moments) -> Moments:
     """
     (n_a, mean_a, m2_a), (n_b, mean_b, m2_b) = a, b
     n = n_a + n_b
-    # Padding has n = 0 on both sides, and must not become NaN.
+    # Padding has n = 0 on both sides, which must not give NaN.
     weight = n_b / jnp.maximum(n, 1.0)
     # About the means: sums of squares minus squared sums would cancel in float32.
     d = mean_b - mean_a
@@ -78,7 +78,7 @@ def join(state: MapState, new: Statistics) -> MapState:
     Bins unite, the best resolution wins, and moments are combined.
     """
     key, row = find_or_insert(state.key, new.key, new.valid)
-    # Padding and lost voxels have row N: they read zeros here and are dropped by `put`.
+    # Padding and dropped voxels have row N: they read zeros here, and `put` ignores them.
     at: Callable[[Array], Array] = lambda x: x.at[..., row].get(mode="fill", fill_value=0)
 
     def put(x: Array, value: Array) -> Array:
@@ -86,12 +86,12 @@ def join(state: MapState, new: Statistics) -> MapState:
 
     # New rows read zeros here: an empty row has zero moments, so joining is inserting.
     before = at(state.count), at(state.mean), at(state.m2)
-    # A row whose voxel was removed keeps its place in the table; its marks are void.
+    # The row of a removed voxel stays in the table; its statistics are reset.
     is_known = before[0] > 0.0
     bins = jnp.where(is_known[None, :], at(state.visited), jnp.uint32(0))
     sharpness = jnp.where(is_known, at(state.resolution), 0.0)
     count, mean, m2 = combine_moments(before, (new.count, new.mean, new.m2))
-    # Counted, not raised: inside jit a full table can only be told of.
+    # Counted, not raised: nothing can be raised under jit.
     is_lost = new.valid & (row >= state.capacity)
     return MapState(
         key=key,
@@ -110,7 +110,7 @@ def join(state: MapState, new: Statistics) -> MapState:
 def _joined_misses(
     state: MapState, new: Statistics, row: Int[Array, " M"], is_known: Bool[Array, " M"]
 ) -> UInt8[Array, " N"] | None:
-    """Looks through each row: the fewer of the two where both know the voxel."""
+    """Computes the frames that saw through each row: the minimum if both maps have the voxel."""
     if state.misses is None or new.misses is None:
         return state.misses
     before = state.misses.at[row].get(mode="fill", fill_value=0)
@@ -132,7 +132,7 @@ def _join_map(state: MapState, other: MapState) -> MapState:
             state,
             Statistics(
                 key=rows(other.key),
-                # Rows of removed voxels are left behind.
+                # Rows of removed voxels are not copied.
                 valid=rows(other.present),
                 count=rows(other.count),
                 mean=rows(other.mean),
@@ -144,7 +144,7 @@ def _join_map(state: MapState, other: MapState) -> MapState:
         )
 
     state = jax.lax.fori_loop(0, other.capacity // size, join_chunk, state)
-    # What `other` had lost before is missing from the union as well.
+    # Voxels that `other` dropped are missing from the union, too.
     return eqx.tree_at(lambda m: m.dropped, state, state.dropped + other.dropped)
 
 
@@ -152,15 +152,15 @@ def _join_map(state: MapState, other: MapState) -> MapState:
 def merge(a: MapState, b: MapState) -> MapState:
     """Merges the observations of `a` and `b` into one map, in a table of `a`'s capacity.
 
-    Exact: equal to integrating both sequences into one map, beyond rounding and row order.
-    Voxels that find no row are counted in `dropped`; grow `a` first if both are large.
+    Exact: equal to integrating both sequences into one map, up to rounding and row order. Voxels
+    beyond the capacity are dropped and counted in `dropped`; grow `a` first if both are large.
 
     Raises:
         ValueError: voxel sizes or numbers of bins that differ.
     """
     if a.num_bins != b.num_bins:
         raise InputError(f"the maps have {a.num_bins} and {b.num_bins} direction bins")
-    # Other lattices cannot be joined exactly: no nearest voxel would be the right one.
+    # Different lattices cannot be joined exactly.
     sizes = (a.voxel_size, b.voxel_size)
     if not is_traced(*sizes) and float(sizes[0]) != float(sizes[1]):
         raise InputError(f"the maps have voxels of {float(sizes[0])} m and {float(sizes[1])} m")
@@ -178,6 +178,6 @@ def grow(state: MapState, capacity: int) -> MapState:
         raise InputError(f"cannot shrink a map of {state.capacity} rows to {capacity}")
     remove_moved = state.misses is not None
     larger = empty_map(capacity, float(state.voxel_size), state.num_bins, remove_moved=remove_moved)
-    # The very bits: a rounded edge would move voxel borders.
+    # Bit-identical: a rounded voxel size would move voxel borders.
     larger = eqx.tree_at(lambda m: m.voxel_size, larger, state.voxel_size)
     return _join_map(larger, state)

@@ -1,4 +1,4 @@
-"""From points to rows of the map."""
+"""Finds the rows of points in the map."""
 
 import jax
 import jax.numpy as jnp
@@ -13,20 +13,20 @@ from r3jax.mapping.table import find
 @checked(state=a_map, points_world=points_of_3)
 @jax.jit
 def lookup(state: MapState, points_world: Float[Array, "*n 3"]) -> Int[Array, "*n"]:
-    """Finds the row of the voxel that holds each point; `state.capacity` if the map has none.
+    """Finds the row of the voxel that contains each point; `state.capacity` if there is none.
 
     Args:
         state: the map.
         points_world: points [m]; points that are not finite are in no voxel.
 
     Raises:
-        TypeError: no map, or no array.
+        TypeError: not a map, or not an array.
         ValueError: points without three coordinates.
     """
     points = points_world.reshape(-1, 3)
-    # An edge that is NaN marks a map that an unsound pose has spoiled: nothing is found in it.
+    # A voxel size of NaN marks a map spoiled by an invalid pose: nothing is found in it.
     is_finite = jnp.all(jnp.isfinite(points), axis=1) & jnp.isfinite(state.voxel_size)
-    # NaN has no integer: such points ask for voxel 0, and the answer is masked.
+    # NaN has no integer: such points look up voxel 0, and the result is masked.
     index = voxel_index(jnp.where(is_finite[:, None], points, 0.0), state.voxel_size)
     low, high = pack(index[:, 0], index[:, 1], index[:, 2])
     row = find(state.key, jnp.stack([low, high]), is_finite)

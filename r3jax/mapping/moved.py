@@ -1,14 +1,13 @@
-"""Removes voxels that frames see through: people who walked on, and stray measurements.
+"""Removes voxels that later frames see through: people who have moved on, and outliers.
 
 A frame sees through a voxel if every pixel of the voxel's footprint measures something behind it,
-by more than the noise of the depth. The footprint, not one pixel: a cable fills a part of it, and
-a pane of glass is measured in some of its pixels; a hole tells nothing. From farther than three
-times the closest look, or where a voxel is smaller than a pixel and a half, nothing is concluded.
-Such looks are counted; a frame that measures the voxel's place sets the count back to 0. After two
-of them (three, where more than two frames had measured it) the voxel is removed: its row stays in
-the table, without observations, and describes it again as soon as it is measured.
-
-Costs one byte a row.
+by more than the noise of the depth. All of the footprint must agree, because a cable fills only a
+part of it, and a pane of glass is measured in only some of its pixels. Holes are no evidence. Nor
+are frames more than three times as far away as the closest one, or frames in which a voxel is
+smaller than 1.5 pixels. Frames that see through a voxel are counted; a frame that measures a point
+in it resets the count. After two such frames (three, if more than two frames had measured the
+voxel) it is removed: its row stays in the table without observations, and is used again when the
+voxel is measured. Costs one byte per row.
 
 Shape symbols: N capacity of the map; H W image size; L levels of the minima.
 """
@@ -25,12 +24,12 @@ from r3jax.mapping.state import MapState
 
 
 def count_misses(state: MapState, frame: Frame, max_range: Float[Array, ""]) -> MapState:
-    """Counts looks through each voxel, and removes those that were looked through often.
+    """Counts the frames that see through each voxel, and removes voxels with enough of them.
 
     Args:
-        state: the map, with the frame's pixels in it; as it is where it does not count misses.
+        state: the map, after the frame's pixels were added; returned unchanged if it has no counts.
         frame: the frame.
-        max_range: voxels farther from the camera than this are not judged [m].
+        max_range: voxels farther from the camera are ignored [m].
     """
     if state.misses is None:
         return state
@@ -52,11 +51,11 @@ def count_misses(state: MapState, frame: Frame, max_range: Float[Array, ""]) -> 
 def judge_rows(
     state: MapState, frame: Frame, max_range: Float[Array, ""]
 ) -> tuple[Bool[Array, " N"], Bool[Array, " N"]]:
-    """Finds the voxels whose place a frame measures, and those that it sees through."""
+    """Finds the voxels in which a frame measures a point, and those that it sees through."""
     camera, size = frame.camera, state.voxel_size
     is_in, z, row, column = project_rows(state, frame, max_range)
     is_in &= state.present
-    # Masked rows lie anywhere; any depth will do for them.
+    # Masked rows may be anywhere; their depth is not used.
     z = jnp.maximum(z, 1e-3)
     slack = constants.SLACK_EDGES * size + constants.SLACK_NOISE * z
     measured = frame.depth[row, column]
@@ -76,11 +75,11 @@ def _nearest_around(
     column: Int[Array, " N"],
     half: Int[Array, " N"],
 ) -> Float[Array, " N"]:
-    """Finds the least depth in a square of 2 half + 1 pixels; 0 if too large or off the image."""
+    """Computes the minimum depth in a square of 2 half + 1 pixels; 0 if it leaves the image."""
     height, width = depth.shape
     is_in = (half <= constants.MOST_HALF) & (row >= half) & (column >= half)
     is_in &= (row + half < height) & (column + half < width)
-    # Minima of squares of 1, 2, 4 ... pixels; four of them cover any square exactly.
+    # Minima of squares of 1, 2, 4, ... pixels; four of them cover any square exactly.
     minima = [depth]
     while 2 << len(minima) <= 2 * constants.MOST_HALF + 2:
         step = 1 << (len(minima) - 1)

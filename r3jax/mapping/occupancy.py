@@ -7,15 +7,15 @@ The model, per cell and frame (log-odds as in Active-GS, Jin et al. 2025):
     pass  - step: at least half of the cell was seen through, and no point of the frame lies in it
     else    0, and the sum is clipped to +-4.5
 
-One look decides (a cell at 5 m gets 1.4 > ln 4). **Seen through* is tested at the centers of the
-cell's eight octants. Such a point passes if it lies in the image, within range, and before
-the nearest measurement of its block of pixels (about one degree wide), short of it by a quarter
-of a cell. Asking the cells, not walking the rays, leaves no gaps far away, lets no ray that only
-grazes a cell's corner clear it, and costs one gather per point.
+One observation decides (a cell at 5 m gets 1.4 > ln 4). **Seen through* is tested at the centers of
+the cell's eight octants. Such a center was seen through if it lies in the image, within range, and
+at least a quarter of a cell before the nearest measurement in its block of pixels (about one degree
+wide). Testing cells instead of tracing rays leaves no gaps far away, does not clear cells that a
+ray only grazes, and costs one gather per point.
 
-Consequences worth knowing: the nearest measurement rules its block, so rays that pass beside a
-thin object cannot carve it away; a cell called free may still hold a surface in the half that
-was not in the image; and a wall seen with 1 % noise at 4 m is a cell thicker than it is.
+Consequences: the nearest measurement decides for its block, so that rays beside a thin object do
+not carve it away; a free cell may still contain a surface in the half that was not in the image;
+and a wall measured with 1 % noise at 4 m is one cell too thick.
 
 Shape symbols: X Y Z cells along the axes; H W image size; h w blocks; n points.
 """
@@ -44,61 +44,61 @@ OCCUPIED_LOG_ODDS = 1.3862944
 """A cell is occupied above this: p = 0.8."""
 
 LOG_ODDS_LIMIT = 4.5
-"""Log-odds are clipped to +- this, so that a change of the world can be unlearned."""
+"""Log-odds are clipped to +- this, so that cells can change their state."""
 
 STEP = 2.8
-"""Log-odds step of a look from distance 0."""
+"""Log-odds step of an observation from distance 0."""
 
 STEP_DECAY = 0.1
-"""Share of the step lost per meter [1/m]."""
+"""Decrease of the step per meter [1/m]."""
 
 VOUCHED_LOG_ODDS = -1.5
-"""What `mark_free_ball` sets: free, but a single hit within range undoes it."""
+"""Log-odds set by `mark_free_ball`: free, but a single hit within range makes the cell occupied."""
 
 BLOCKS_ACROSS = 64
 """Blocks per image row: 8 pixels of a 512-pixel row, 9 cm at 5 m with 60 degrees of view."""
 
 KEEP_OUT, COSTMAP, REFUSED = 1, 2, 4
-"""Marks of cells: a zone that no robot may enter, an obstacle of a costmap, a goal not reached."""
+"""Marks of cells: a keep-out zone, an obstacle of a costmap, a goal that was not reached."""
 
 _OCTANTS = tuple((x, y, z) for x in (-0.25, 0.25) for y in (-0.25, 0.25) for z in (-0.25, 0.25))
 """Centers of a cell's octants, from its center, in cells."""
 
 MAX_CELLS = 50_000_000
-"""More than this is a mistake in the bounds (a scene in millimeters), not a grid."""
+"""Maximum number of cells; more indicate wrong bounds (a scene in millimeters)."""
 
 
 class OccupancyGrid(eqx.Module):
     """Log-odds of occupancy over an axis-aligned box."""
 
     log_odds: Float[Array, "X Y Z"]
-    """Log-odds that the cell holds matter, clipped to +-4.5; 0: never touched."""
+    """Log-odds of occupancy, clipped to +-4.5; 0: never observed."""
 
     origin: Float[Array, " 3"]
     """Lower corner of cell (0, 0, 0) in the world [m]."""
 
     cell_size: Float[Array, ""]
-    """Edge of a cell [m]."""
+    """Cell size [m]."""
 
     explorable: Bool[Array, "X Y Z"] | None = None
-    """Mask of the cells that count as unexplored while nothing is known of them; None: all."""
+    """Mask of the cells that may count as unexplored; None: all."""
 
     marks: UInt8[Array, "X Y Z"] | None = None
-    """What others say of the cells, whatever they hold: sums of `KEEP_OUT`, `COSTMAP` and
-    `REFUSED`; None: nothing."""
+    """Marks of the cells, independent of their log-odds: sums of `KEEP_OUT`, `COSTMAP` and
+    `REFUSED`; None: no marks."""
 
     @property
     def closed(self) -> Bool[np.ndarray, "X Y Z"] | None:
-        """Cells that no robot may enter: keep-out zones, a costmap's obstacles; None: no such."""
+        """Cells that the robot must not enter (keep-out zones, a costmap's obstacles), or None."""
         return None if self.marks is None else (np.asarray(self.marks) & (KEEP_OUT | COSTMAP)) > 0
 
     @property
     def refused(self) -> Bool[np.ndarray, "X Y Z"] | None:
-        """Cells round goals that a robot could not reach: it may pass, not stop; None: no such."""
+        """Cells around goals that were not reached, in which the robot must not stop, or None."""
         return None if self.marks is None else (np.asarray(self.marks) & REFUSED) > 0
 
     def marked(self, cells: Bool[Array | np.ndarray, "X Y Z"], mark: int) -> "OccupancyGrid":
-        """Sets one mark in some cells, and takes it from all others."""
+        """Sets one mark in the given cells, and removes it from all others."""
         before = np.zeros(self.log_odds.shape, np.uint8) if self.marks is None else self.marks
         others = np.asarray(before) & np.uint8(255 - mark)
         return replace(self, marks=jnp.asarray(others | np.where(cells, mark, 0).astype(np.uint8)))
@@ -110,22 +110,22 @@ class OccupancyGrid(eqx.Module):
 
     @property
     def occupied(self) -> Bool[Array, "X Y Z"]:
-        """Cells known to hold matter."""
+        """Cells known to be occupied."""
         return self.log_odds > OCCUPIED_LOG_ODDS
 
     @property
-    @jax.jit  # one program, not one for every operation: planning asks outside of jit
+    @jax.jit  # jitted: planning calls it outside jit, where every operation would be a program
     def unexplored(self) -> Bool[Array, "X Y Z"]:
-        """Cells that are neither, and may be explored."""
-        # The mask never makes a known cell unexplored; it only drops unknown ones.
+        """Cells that are neither free nor occupied, and may be explored."""
+        # The mask only removes unknown cells; it never makes a known cell unexplored.
         unknown = ~(self.free | self.occupied)
         return unknown if self.explorable is None else unknown & self.explorable
 
     def ignoring(self, cells: Bool[Array | np.ndarray, "X Y Z"]) -> "OccupancyGrid":
-        """Masks cells out for one decision: they do not count, whatever they hold.
+        """Excludes cells from the unexplored ones for one decision.
 
-        What is known of them stays: a planner that wrote them as occupied would have a robot's
-        body collide with space that was never seen.
+        Their log-odds stay: if they were marked as occupied, the robot's body would collide with
+        space that was never seen.
         """
         left = jnp.asarray(~cells, dtype=bool)
         if self.explorable is not None:
@@ -164,8 +164,8 @@ def empty_grid(bounds: np.ndarray | Array, cell_size: float = 0.2) -> OccupancyG
         faces lie inside.
 
     Raises:
-        ValueError: bounds that are not finite, not ordered or far from the origin, a cell size
-            that is not positive, or more cells than a grid can sensibly have.
+        ValueError: bounds that are not finite, not ordered or far from the origin, a cell size that
+            is not positive, or too many cells.
     """
     box = np.asarray(bounds, dtype=np.float64)
     if box.shape != (2, 3) or not np.all(np.isfinite(box)) or not np.all(box[1] > box[0]):
@@ -192,7 +192,7 @@ def empty_grid(bounds: np.ndarray | Array, cell_size: float = 0.2) -> OccupancyG
 
 
 def world_to_cell(grid: OccupancyGrid, points_world: Float[Array, "*n 3"]) -> Int[Array, "*n 3"]:
-    """Finds the cell that holds each point; outside the grid the index lies outside its shape."""
+    """Finds the cell that contains each point; outside the grid the index is out of its shape."""
     # Reshaped, not broadcast: the tests let JAX raise on implicit rank promotion.
     origin = grid.origin.reshape((1,) * (points_world.ndim - 1) + (3,))
     index = jnp.floor((points_world - origin) / grid.cell_size)
@@ -207,17 +207,17 @@ def cell_centers(grid: OccupancyGrid, cells: Int[Array, "*n 3"]) -> Float[Array,
 
 
 def centers_on_host(grid: OccupancyGrid, cells: np.ndarray) -> np.ndarray:
-    """Computes `cell_centers` of cells [n, 3] by NumPy in float64: nothing compiles."""
+    """Computes `cell_centers` of cells [n, 3] by NumPy in float64, without compiling."""
     return np.asarray(grid.origin, np.float64) + (cells + 0.5) * float(grid.cell_size)
 
 
 def log_odds_at(
     grid: OccupancyGrid, points_world: Float[Array, "*n 3"], outside: float = 0.0
 ) -> Float[Array, "*n"]:
-    """Reads the log-odds of the cell that holds each point; `outside` beyond the grid."""
+    """Reads the log-odds of the cell that contains each point; `outside` beyond the grid."""
     index = world_to_cell(grid, points_world)
     inside = _inside(grid, index)
-    # Cell 0 stands in: a negative index would read from the far side of the grid.
+    # Replaced by cell 0: a negative index would read from the far side of the grid.
     x, y, z = (jnp.where(inside, index[..., i], 0) for i in range(3))
     return jnp.where(inside, grid.log_odds[x, y, z], outside)
 
@@ -237,11 +237,11 @@ def frontier_unexplored(grid: OccupancyGrid) -> Bool[Array, "X Y Z"]:
 def mark_free_ball(
     grid: OccupancyGrid, center: Float[Array, " 3"], radius: float | Float[Array, ""]
 ) -> OccupancyGrid:
-    """Marks the cells whose center lies in a ball as free, on the caller's word.
+    """Marks the cells whose center lies in a ball as free, without a measurement.
 
-    For space that no image shows: the ball round the start, which the simulator promises to
-    be free, and the robot's own body. A cell that was measured to be occupied stays so, and a
-    single later hit undoes the mark.
+    For space that no image shows: the ball around the start, which the simulator guarantees to be
+    free, and the robot's own body. Cells measured as occupied stay occupied, and a single later hit
+    overrides the mark.
 
     Args:
         grid: the grid.
@@ -249,7 +249,7 @@ def mark_free_ball(
         radius: its radius [m].
     """
     is_in_ball = _distance(grid, center) <= jnp.asarray(radius, dtype=jnp.float32)
-    # The minimum: what measurements have made freer than the caller's word stays so.
+    # The minimum: cells that measurements have made freer stay so.
     vouched = jnp.where(
         is_in_ball & ~grid.occupied, jnp.minimum(grid.log_odds, VOUCHED_LOG_ODDS), grid.log_odds
     )
@@ -264,17 +264,17 @@ def integrate_depth(
 
     Args:
         grid: the grid before the frame.
-        frame: depth 0 says nothing about its ray; a depth that is `inf` or farther than
-            `max_range` says that its ray is free up to `max_range`.
+        frame: the frame. A depth of 0 is no measurement; if it is `inf` or beyond `max_range`, the
+            ray is free up to `max_range`.
         max_range: range of the sensor, straight from the camera's center [m].
 
     Returns:
-        The grid after the frame. Measurements outside the grid are ignored. Where the frame's
-        pose is not rigid (which only jit lets through), the edge of the cells is NaN, and so is
-        every score from then on.
+        The grid after the frame. Measurements outside the grid are ignored. If the frame's pose is
+        not rigid (possible only under jit), the cell size becomes NaN, and so does every later
+        score.
 
     Raises:
-        TypeError: no grid, or no frame.
+        TypeError: not a grid, or not a frame.
         ValueError: several at once, without `jax.vmap`.
     """
     reach = jnp.asarray(max_range, dtype=jnp.float32)
@@ -283,11 +283,11 @@ def integrate_depth(
     passed = _passed_cells(grid, frame, reach) & ~hit
     # A point within range may lie in a cell whose center is not: its step is that of the range.
     distance = jnp.minimum(_distance(grid, frame.position), reach)
-    # A look from afar says less: beyond 10 m it would say nothing.
+    # Distant observations count less; beyond 10 m they would count nothing.
     step = STEP * jnp.clip(1.0 - STEP_DECAY * distance, 0.0, 1.0)
     change = jnp.where(hit, step, jnp.where(passed, -step, 0.0))
     log_odds = jnp.clip(grid.log_odds + change, -LOG_ODDS_LIMIT, LOG_ODDS_LIMIT)
-    # Under jit nothing can be refused: NaN makes every later score say so.
+    # Nothing can be raised under jit: NaN spreads to every later score.
     cell_size = grid.cell_size * nan_unless_valid(frame.camera, frame.T_world_camera)
     return eqx.tree_at(lambda g: (g.log_odds, g.cell_size), grid, (log_odds, cell_size))
 
@@ -305,9 +305,9 @@ def integrate_rays(
 
     Args:
         grid: the grid before the scan.
-        points: where the rays ended [m]; farther than `max_range`: free up to there.
-        sensors: where they began [m].
-        max_range: of the sensor [m].
+        points: end points of the rays [m]; beyond `max_range` the ray is free up to there.
+        sensors: their origins [m].
+        max_range: range of the sensor [m].
     """
     from r3jax.kernels.robot.cells import walk_rays
 
@@ -319,7 +319,7 @@ def integrate_rays(
     nearest = np.full(grid.log_odds.shape, np.inf)
     kind = np.zeros(grid.log_odds.shape, np.int8)
     walk_rays((sensors - origin) / size, (ends - origin) / size, is_hit, kind, nearest)
-    # Of a cell that several rays saw, the nearest look counts, as of an image.
+    # If several rays pass a cell, the nearest sensor position counts, as for images.
     far = np.where(np.isfinite(nearest), nearest * size, max_range)
     step = STEP * np.clip(1.0 - STEP_DECAY * far, 0.0, 1.0)
     change = np.where(kind == 2, step, np.where(kind == 1, -step, 0.0)).astype(np.float32)
@@ -330,7 +330,7 @@ def integrate_rays(
 def _hit_cells(
     grid: OccupancyGrid, frame: Frame, max_range: Float[Array, ""]
 ) -> Bool[Array, "X Y Z"]:
-    """Finds cells that hold at least one measured point within range."""
+    """Finds cells that contain at least one measured point within range."""
     x, y = _ray_slopes(frame.camera)
     is_measured = (frame.depth > 0.0) & jnp.isfinite(frame.depth)
     # Replaced before the arithmetic: inf times a slope of 0 is NaN.
@@ -344,9 +344,9 @@ def _hit_cells(
         point = (T[axis, 0] * x + T[axis, 1] * y + T[axis, 2]) * z + T[axis, 3]
         cell = jnp.floor((point - grid.origin[axis]) / grid.cell_size)
         is_hit = is_hit & (cell >= 0.0) & (cell < n)
-        # Meaningless, perhaps wrapped round, for points outside: they are replaced below.
+        # Meaningless for points outside, where it may overflow; replaced below.
         flat = flat * n + cell.astype(jnp.int32)
-    # Out of range on purpose where there is no hit: scatters drop it, but -1 would wrap around.
+    # Out of range if there is no hit: scatters drop it, while -1 would wrap around.
     flat = jnp.where(is_hit, flat, grid.log_odds.size).reshape(-1)
     hits = jnp.zeros(grid.log_odds.size, dtype=bool).at[flat].max(True, mode="drop")
     return hits.reshape(grid.log_odds.shape)
@@ -363,12 +363,12 @@ def _passed_cells(
 ) -> Bool[Array, "X Y Z"]:
     """Finds cells of which at least four octants' centers were seen through."""
     camera = frame.camera
-    # The whole grid is turned into the camera's frame, since cells are asked, not rays.
+    # The whole grid is transformed into the camera's frame, since cells are tested, not rays.
     T_camera_world = invert_pose(frame.T_world_camera)
     R = T_camera_world[:3, :3]
     shift = R @ grid.origin + T_camera_world[:3, 3]
     nearest, block = _nearest_by_block(camera, frame.depth)
-    # The image of the blocks is an image of its own: in it a pixel is a block.
+    # A camera whose pixels are the blocks.
     fx, fy, cx, cy = (p / block for p in (camera.fx, camera.fy, camera.cx, camera.cy))
     num_rows, num_columns = nearest.shape
     width, height = camera.width / block, camera.height / block
@@ -405,16 +405,16 @@ def _nearest_by_block(
 ) -> tuple[Float[Array, "h w"], int]:
     """Finds the least z-depth in each block of pixels, and the block's side [px].
 
-    A block without any measurement gets 0: nothing passes it.
+    A block without any measurement gets 0, so that nothing was seen through it.
     """
     block = max(1, camera.width // BLOCKS_ACROSS)
     window = (block, block)
-    # Blocks start at pixel (0, 0); only the last row and column may stick out.
+    # Blocks start at pixel (0, 0); the last row and column may exceed the image.
     padding = [(0, -size % block) for size in depth.shape]
-    # Holes must not win the minimum, or one lost pixel would close its whole block.
+    # Holes must not be the minimum, or one of them would block its whole block.
     measured = jnp.where(depth > 0.0, depth, jnp.inf)
     nearest = jax.lax.reduce_window(measured, jnp.inf, jax.lax.min, window, window, padding)
-    # The minimum is inf for a block of holes and for one that looks into the open: this parts them.
+    # Distinguishes a block of holes from one without surfaces in range: both have the minimum inf.
     any_measured = jax.lax.reduce_window(depth, 0.0, jax.lax.max, window, window, padding)
     return jnp.where(any_measured > 0.0, nearest, 0.0), block
 

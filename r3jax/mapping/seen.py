@@ -1,8 +1,8 @@
-"""Marks voxels that a frame looked at, whether or not one of its pixels fell into them.
+"""Marks voxels in view of a frame, even if none of its pixels fell into them.
 
-A frame's points do not touch all that it sees: of a floor seen at a grazing angle one voxel in
-five, of what lies on a depth edge or behind glass none. Such a voxel would keep a low
-renderability however often it is in view, and a planner would look at it without end.
+A frame's points do not touch all visible voxels: only one in five of a floor at a grazing angle,
+and none on a depth edge or behind glass. Such voxels would keep a low renderability however often
+they are in view, and a planner would look at them endlessly.
 
 Shape symbols: N capacity of the map; M voxels at a time; W words of bins; H W image size.
 """
@@ -33,7 +33,7 @@ _Marks = tuple[UInt32[Array, "W N"], Float[Array, " N"]]
 """A map's direction bins and best resolutions."""
 
 _FARTHEST = 1e4
-"""Stands for a range without an end [m]."""
+"""Replaces an infinite range [m]."""
 
 
 def bin_words(bins: Int[Array, " M"], num_words: int) -> UInt32[Array, "W M"]:
@@ -52,7 +52,7 @@ def evidence_of_view(
     """Computes the observation of voxels from a camera: direction bin and resolution.
 
     Args:
-        state: the map; of it, the number of bins.
+        state: the map; only its number of bins is used.
         center: of the voxels [m].
         position: of the camera, one for all or one for each [m].
         focal: its focal length [px].
@@ -61,7 +61,7 @@ def evidence_of_view(
         The bin towards the camera as one bit, and focal length over distance [px/m].
     """
     offset = (position if position.ndim == 2 else position[:, None]) - center
-    # A camera inside a voxel has no direction to it, and must not divide by zero.
+    # The direction to a voxel is undefined for a camera inside it: avoid dividing by zero.
     distance = jnp.maximum(safe_norm(offset, axis=0), 1e-6)
     bins = nearest_bin(offset / distance[None, :], state.num_bins)
     # The paper's resolution is one over the distance; the focal length makes cameras comparable.
@@ -74,9 +74,9 @@ def mark_rows(
     position: Float[Array, " 3"],
     focal: Float[Array, ""],
 ) -> MapState:
-    """Sets the direction bin of some rows and raises their best resolution, as seen from a camera.
+    """Sets the direction bin of visible rows and raises their best resolution.
 
-    Count and colors belong to pixels, and stay.
+    Count and colors, which come from pixels, stay.
 
     Args:
         state: the map before.
@@ -88,7 +88,7 @@ def mark_rows(
 
     def mark(index: Int[Array, " M"], valid: Bool[Array, " M"], marks: _Marks) -> _Marks:
         visited, resolution = marks
-        # Padding holds the index of a real row, and must not write to it.
+        # Padding has the index of a real row, and must not write to it.
         row = jnp.where(valid, index, num)
         words, sharper = evidence_of_view(state, state.center_of(index), position, focal)
         # Rows are distinct: the order of the writes does not matter.
@@ -137,21 +137,21 @@ def _seen_in_view_jvp(primals: Any, tangents: Any) -> Any:
 
 def visible_rows(state: MapState, view: View, config: VisibilityConfig) -> Bool[Array, " N"]:
     """Finds the voxels that a view sees."""
-    # One that does not count: batches of arrays without elements cannot be reshaped.
+    # A dummy row: batches of empty arrays cannot be reshaped.
     zero = jnp.zeros(1)
     return seen_in_view(state, Cells(zero, zero, zero, zero > 0), view, config)[0]
 
 
 def mark_seen(state: MapState, frame: Frame, max_range: float | Float[Array, ""]) -> MapState:
-    """Counts every voxel in view that nothing hides as seen from the frame's camera.
+    """Marks every voxel in view that nothing hides as seen from the frame's camera.
 
-    Voxels in front of the measured surface count too: the sensor's noise has put them there, and
-    there is no more to be seen of them.
+    Voxels in front of the measured surface count, too: they come from the sensor's noise, and more
+    views would not show more of them.
 
     Args:
-        state: the map, with the frame's pixels in it.
+        state: the map, after the frame's pixels were added.
         frame: the frame.
-        max_range: voxels farther from the camera than this are not seen [m].
+        max_range: voxels farther from the camera do not count [m].
     """
     seen = rows_in_view(state, frame, jnp.asarray(max_range, dtype=jnp.float32))
     return mark_rows(state, seen, frame.position, frame.camera.focal)
@@ -160,18 +160,18 @@ def mark_seen(state: MapState, frame: Frame, max_range: float | Float[Array, ""]
 def rows_in_view(state: MapState, frame: Frame, max_range: Float[Array, ""]) -> Bool[Array, " N"]:
     """Finds the voxels within range that the frame shows.
 
-    Where it has a measurement, those whose center is no farther. Where it has none, those that no
-    other voxel hides: the color image shows what lies behind glass anyway, and whatever
-    the map does not know of is in front of it in every later view from here, too.
+    Where depth was measured, these are the voxels whose center is not farther. Elsewhere they are
+    those that no other voxel hides: the color image shows surfaces behind glass anyway, and an
+    occluder missing from the map will also hide them in later views from here.
     """
     is_in, z, row, column = project_rows(state, frame, max_range)
-    # On a slope the depth changes within a pixel: the farthest of its neighbors limits.
+    # On a slope the depth changes within a pixel: the farthest of its neighbors is the limit.
     farthest = jax.lax.reduce_window(frame.depth, 0.0, jax.lax.max, (3, 3), (1, 1), "SAME")
-    # A hole stays a hole: what its neighbors measure says nothing of its own ray.
+    # A hole stays a hole: its neighbors' depths do not apply to its ray.
     farthest = jnp.where(frame.depth > 0.0, farthest, 0.0).reshape(-1)
     pixel = row * frame.camera.width + column
     measured = farthest[pixel]
-    # One edge of slack: a surface may lie anywhere within its voxel.
+    # A tolerance of one voxel: a surface may lie anywhere within its voxel.
     is_shown = (measured > 0.0) & (z <= measured + state.voxel_size)
     is_hole = frame.depth.reshape(-1)[pixel] == 0.0
     return is_in & (is_shown | (is_hole & hidden_by_none(state, frame, max_range)))
@@ -183,8 +183,8 @@ def project_rows(
     """Projects the centers of voxels into a frame.
 
     Returns:
-        Whether each lies in the image and within range, its z-depth [m], and its pixel: row and
-        column, some pixel of the image where it does not.
+        Whether each lies in the image and within range, its z-depth [m], and its pixel (row and
+        column; arbitrary if it does not).
     """
     camera, T = frame.camera, invert_pose(frame.T_world_camera)
     center = state.center
@@ -193,27 +193,27 @@ def project_rows(
         return T[i, 0] * center[0] + T[i, 1] * center[1] + T[i, 2] * center[2] + T[i, 3]
 
     x, y, z = along(0), along(1), along(2)
-    # At and behind the camera any finite factor will do: those voxels are masked.
+    # At and behind the camera any finite factor: those voxels are masked.
     per_z = 1.0 / jnp.maximum(z, 1e-3)
     u, v = camera.fx * x * per_z + camera.cx, camera.fy * y * per_z + camera.cy
     is_in = state.occupied & (z > 1e-3) & (u >= 0.0) & (u < camera.width)
     is_in &= (v >= 0.0) & (v < camera.height)
-    # Straight from the camera, as the grid and the scores have it; depth alone is along the axis.
+    # Distance from the camera, as in the grid and the scores; only depth is along the axis.
     is_in &= x * x + y * y + z * z <= max_range * max_range
-    # Clipped before the cast: voxels out of the image lie anywhere, and are masked.
+    # Clipped before the cast: voxels out of the image may be anywhere, and are masked.
     column = jnp.clip(u, 0.0, camera.width - 1.0).astype(jnp.int32)
     row = jnp.clip(v, 0.0, camera.height - 1.0).astype(jnp.int32)
     return is_in, z, row, column
 
 
 def hidden_by_none(state: MapState, frame: Frame, max_range: Float[Array, ""]) -> Bool[Array, " N"]:
-    """Finds the voxels that the map itself shows in a frame's view, if depth failed anywhere."""
+    """Finds the voxels that no other voxel hides in a frame's view, if depth failed anywhere."""
 
     def look() -> Bool[Array, " N"]:
         config = VisibilityConfig(max_range=jnp.minimum(max_range, _FARTHEST))
         view = pinhole_view(frame.camera, frame.T_world_camera, config)
         return visible_rows(state, view, config)
 
-    # A branch: a depth buffer of the whole map is needed only where depth has failed.
+    # A branch: a depth buffer of the whole map is only needed if depth failed somewhere.
     nothing: Callable[[], Bool[Array, " N"]] = lambda: jnp.zeros(state.capacity, dtype=bool)
     return jax.lax.cond(jnp.any(frame.depth == 0.0), look, nothing)

@@ -1,7 +1,7 @@
 """The direction-aware voxel map: what has been seen, from where, and how consistently.
 
-The map is a fixed-capacity hash table; row `i` describes one occupied voxel. Arrays keep the
-long axis last, which is what XLA vectorizes on a CPU.
+The map is a fixed-capacity hash table; row `i` describes one occupied voxel. The long axis of
+arrays is last, because XLA vectorizes over it on CPUs.
 
 Shape symbols used throughout the package:
     N  capacity of the table       M  observations of one frame
@@ -24,7 +24,7 @@ from r3jax.visibility.depth_buffer import Voxels
 
 
 class MapState(eqx.Module):
-    """Everything the map remembers between frames: 40 bytes a row, 41 where voxels are removed.
+    """The state of the map: 40 bytes per row, 41 if voxels may be removed.
 
     Invariants: `m2 >= 0`; a bin once visited stays visited; `dropped` never decreases; a key
     occurs once.
@@ -52,7 +52,7 @@ class MapState(eqx.Module):
     """Edge of a voxel [m]."""
 
     dropped: Int[Array, ""]
-    """Observations that found no row because the table was full. Sticky."""
+    """Number of observations dropped because the table was full. Never decreases."""
 
     num_bins: int = eqx.field(static=True)
     """Direction bins B."""
@@ -66,17 +66,17 @@ class MapState(eqx.Module):
         """Number of rows N."""
         return self.count.shape[-1]
 
-    # One program each, not one for every operation: what loops ask for outside of jit.
+    # Jitted: loops call these outside jit, where every operation would be a program.
     @property
     @jax.jit
     def occupied(self) -> Bool[Array, " N"]:
-        """True for rows in use: they describe a voxel, or one that was removed."""
-        # One word decides: the top bit of a packed key's high word is 0.
+        """True for rows in use, including those of removed voxels."""
+        # One word suffices: the top bit of a packed key's high word is 0.
         return self.key[1] != jnp.uint32(EMPTY_WORD)
 
     @property
     def present(self) -> Bool[Array, " N"]:
-        """True for rows that describe a voxel: not one that was removed, nor padding."""
+        """True for rows that describe a voxel, neither removed nor padding."""
         return self.count > 0.0
 
     @property
@@ -95,7 +95,7 @@ class MapState(eqx.Module):
 
         Args:
             row: which rows.
-            valid: False where there shall be no voxel.
+            valid: False for rows that are to be empty.
         """
         return replace(
             self,
@@ -110,14 +110,14 @@ class MapState(eqx.Module):
 
     @property
     def rows(self) -> MapRows:
-        """What R depends on, as kernels take it."""
+        """The arrays that R depends on, as kernels take them."""
         return MapRows(
             self.key, self.visited, self.count, self.m2, self.resolution, self.voxel_size
         )
 
     @property
     def voxels(self) -> Voxels:
-        """Where the voxels are, of rows that were seen."""
+        """The voxels of rows that were seen, as kernels take them."""
         return Voxels(self.center, self.present, self.voxel_size)
 
     @property

@@ -16,15 +16,15 @@ from r3jax.geometry.voxels import EMPTY_WORD
 from r3jax.kernels.constants import MAX_PROBES
 
 _Search = tuple[Int[Array, ""], Int[Array, " n"], Bool[Array, " n"]]
-"""Number of the probe, row of each key so far, keys still searching."""
+"""Number of the probe, row of each key so far, keys still searched."""
 
 _Bidding = tuple[Int[Array, ""], Int[Array, " N"], Int[Array, " n"], Bool[Array, " n"]]
-"""Number of the probe, owner of each slot, slot that each item has won, items still wanting one."""
+"""Number of the probe, owner of each slot, slot that each item has won, items without a slot."""
 
 
 def hash_key(low: UInt32[Array, " n"], high: UInt32[Array, " n"]) -> UInt32[Array, " n"]:
     """Mixes a packed key to 32 well-spread bits (the finalizer of MurmurHash3, twice)."""
-    # One word after the other: a plain xor of both would let distant voxels cancel to one hash.
+    # One word after the other: with a plain xor of both, distant voxels would share a hash.
     h = _mix(low ^ jnp.uint32(0x9E3779B9))
     return _mix(h ^ (high * jnp.uint32(0x85EBCA6B)))
 
@@ -49,7 +49,7 @@ def find(
 
     def is_unfinished(carry: _Search) -> Bool[Array, ""]:
         probe, _, searching = carry
-        # Bounded: in a full table a key that is absent meets no empty slot.
+        # Bounded: in a full table the probes of a missing key meet no empty slot.
         return jnp.any(searching) & (probe < MAX_PROBES)
 
     def look(carry: _Search) -> _Search:
@@ -57,7 +57,7 @@ def find(
         slot = _slot(hashed, probe, capacity)
         low, high = table[0, slot], table[1, slot]
         is_found = searching & (low == keys[0]) & (high == keys[1])
-        # Nothing is ever deleted, so an empty slot ends the probe sequence for good.
+        # Nothing is ever deleted, so that an empty slot ends the probe sequence.
         is_empty = high == jnp.uint32(EMPTY_WORD)
         return probe + 1, jnp.where(is_found, slot, row), searching & ~is_found & ~is_empty
 
@@ -77,8 +77,8 @@ def find_or_insert(
         valid: False for padding.
 
     Returns:
-        The table with the new keys, and the row of each key: N for padding and for keys that
-        found no place.
+        The table with the new keys, and the row of each key: N for padding and for keys without a
+        free slot.
     """
     capacity = table.shape[1]
     found = find(table, keys, valid)
@@ -92,7 +92,7 @@ def find_or_insert(
 def _claim(
     is_empty: Bool[Array, " N"], hashed: UInt32[Array, " n"], wants: Bool[Array, " n"]
 ) -> Int[Array, " n"]:
-    """Claims an empty slot for each wanting item, along its probe sequence.
+    """Claims an empty slot for each item, along its probe sequence.
 
     The slot is N if there is none.
     """
@@ -107,13 +107,13 @@ def _claim(
         probe, owner, won, wanting = carry
         slot = _slot(hashed, probe, capacity)
         bids = wanting & (owner[slot] == -1)
-        # A slot is open in one round only: afterwards it has an owner.
+        # A slot is free in one round only: afterwards it has an owner.
         owner = owner.at[jnp.where(bids, slot, capacity)].max(item, mode="drop")
         is_won = bids & (owner[slot] == item)
         return probe + 1, owner, jnp.where(is_won, slot, won), wanting & ~is_won
 
     nothing = jnp.full(num_items, capacity, dtype=jnp.int32)
-    # Owners beyond every item: a taken slot never opens again.
+    # Owners beyond every item: a taken slot never becomes free again.
     owner = jnp.where(is_empty, -1, num_items)
     start = (jnp.zeros((), jnp.int32), owner, nothing, wants)
     return jax.lax.while_loop(is_unfinished, bid, start)[2]

@@ -1,4 +1,4 @@
-"""Frames and points become observations, one per touched voxel, and join the map.
+"""Integrates frames and points: makes one observation per touched voxel and joins it into the map.
 
 Shape symbols: P points of a frame; M observations that join at once; H W image size.
 """
@@ -36,7 +36,7 @@ from r3jax.mapping.seen import evidence_of_view, hidden_by_none, mark_seen
 from r3jax.mapping.state import MapState, a_map
 
 _NEAR = 1000.0
-"""Up to here voxels of a millimeter have an index [m]."""
+"""Up to this distance voxels of a millimeter have an index [m]."""
 
 _MAX_LOAD = 0.7
 """The table grows before more than this share of its rows is in use."""
@@ -50,8 +50,8 @@ def observe_voxels(
     camera_position: Float[Array, " 3"] | Float[Array, "3 M"],
     focal: Float[Array, ""],
 ) -> Statistics:
-    """Makes one observation of each voxel from a camera: direction bin, resolution, mean color."""
-    # From the voxel's center, not the points': bins must not depend on how pixels fall.
+    """Makes one observation per voxel: direction bin, resolution, mean color."""
+    # From the voxel's center, not the points': bins must not depend on the pixel grid.
     center = voxel_center(jnp.stack(unpack(key[0], key[1])), state.voxel_size)
     words, resolution = evidence_of_view(state, center, camera_position, focal)
     return Statistics(
@@ -59,7 +59,7 @@ def observe_voxels(
         valid=valid,
         count=valid.astype(jnp.float32),
         mean=jnp.where(valid[None, :], rgb, 0.0),
-        # One observation has no spread of its own: the join adds what lies between observations.
+        # A single observation has no variance: `join` adds that between observations.
         m2=jnp.zeros(valid.shape, dtype=jnp.float32),
         visited=words,
         resolution=resolution,
@@ -77,12 +77,12 @@ def integrate_groups(
     Args:
         state: the map before.
         groups: the points by voxel.
-        camera_position: where they were seen from; one for all, or one for each leader [m].
+        camera_position: camera center; one for all, or one for each leader [m].
         focal: focal length [px].
     """
     num = groups.is_leader.shape[0]
     size = min(num, JOINED)
-    # Rounded up to whole chunks, so that the last slice is never shifted back.
+    # Rounded up to whole chunks, so that the last slice is not shifted.
     leaders = positions_of_set(groups.is_leader, -(-num // size) * size)
     num_voxels = jnp.sum(groups.is_leader, dtype=jnp.int32)
 
@@ -92,7 +92,7 @@ def integrate_groups(
         valid = index < num
         index = jnp.minimum(index, num - 1)
         sums = groups.rgb_sum[index].T
-        # Padding may gather a point that leads nothing, whose number is 0.
+        # Padding may gather a point that is not a leader, whose count is 0.
         rgb = sums[:3] / jnp.maximum(sums[3:], 1.0)
         position = camera_position[index].T if camera_position.ndim == 2 else camera_position
         seen = observe_voxels(state, groups.key[:, index], valid, rgb, position, focal)
@@ -104,10 +104,10 @@ def integrate_groups(
 def integrate_pixels(
     state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
 ) -> MapState:
-    """Adds the frame's measured pixels to the map: the part of `integrate` that counts colors."""
+    """Adds the frame's measured pixels to the map: counts and colors of `integrate`."""
     depth = frame.depth
     factor = nan_unless_valid(frame.camera, frame.T_world_camera)
-    # An unsound pose makes the factor NaN, and NaN > 0 is False: the frame adds nothing.
+    # An invalid pose makes the factor NaN, and NaN > 0 is False: the frame adds nothing.
     is_measured = (depth > 0.0) & jnp.isfinite(depth) & (depth <= max_range) & (factor > 0.0)
     # A branch, not a select: XLA would compute the medians again in each of their consumers.
     valid = jax.lax.cond(
@@ -115,12 +115,12 @@ def integrate_pixels(
         lambda: is_measured & ~edge_pixels(depth, state.voxel_size),
         lambda: is_measured,
     )
-    # 1 m stands for what is not measured: inf would make NaN of the points.
+    # 1 m replaces missing depth: inf would make the points NaN.
     points = points_of_pixels(frame, jnp.where(is_measured, depth, 1.0))
     rgb = frame.rgb.reshape(-1, 3)
     groups = group_by_voxel(points, rgb, valid.reshape(-1), state.voxel_size)
     after = integrate_groups(state, groups, frame.position, frame.camera.focal)
-    # NaN in the edge reaches every later score, and no later frame can undo it.
+    # A voxel size of NaN spreads to every later score, and no later frame can undo it.
     return eqx.tree_at(lambda m: m.voxel_size, after, factor * after.voxel_size)
 
 
@@ -158,7 +158,7 @@ def _pixels_by_kernel(
     state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
 ) -> MapState:
     factor = nan_unless_valid(frame.camera, frame.T_world_camera)
-    # An unsound pose makes the range NaN, which no depth is below: the frame adds nothing.
+    # An invalid pose makes the range NaN, and no depth is below it: the frame adds nothing.
     image = for_kernels(frame, factor * max_range, drop_edges)
     rows, mean, lost = calls.map_add(state.rows, state.mean, image, state.num_bins)
     rows = rows._replace(voxel_size=factor * rows.voxel_size)
@@ -166,7 +166,7 @@ def _pixels_by_kernel(
 
 
 def with_rows(state: MapState, rows: calls.MapRows, **changed: Array) -> MapState:
-    """Returns the map with the rows of a kernel's answer, and other fields that have changed."""
+    """Returns the map with the rows of a kernel's result, and other changed fields."""
     return replace(
         state,
         key=rows.key,
@@ -218,32 +218,32 @@ def integrate(
     *,
     donate: bool = False,
 ) -> MapState:
-    """Adds a posed RGB-D frame to the map: what its pixels touch, and what it looked at.
+    """Integrates a posed RGB-D frame into the map: measured pixels and visible voxels.
 
-    Each voxel that a pixel falls into gets one observation. Every voxel in view that nothing
-    measured hides counts as seen from here, too, pixel or not (`mapping.seen`): without that a
-    planner takes the same view of a ceiling twenty times. Pixels on depth edges take no part: their
-    color mixes two surfaces. Compiled on first use for each image size and capacity.
-    `MapState.dropped` counts what found no row; `integrate_growing` makes room instead.
+    Each voxel that a pixel falls into gets one observation. Every other voxel in view that no
+    measurement hides is marked as seen from here (`mapping.seen`); without that, a planner takes
+    the same view of a ceiling twenty times. Pixels on depth edges are ignored: their color mixes
+    two surfaces. Compiled on first use for each image size and capacity. `MapState.dropped` counts
+    voxels beyond the capacity; `integrate_growing` enlarges the table instead.
 
-    A pose that is not rigid cannot come from outside jit; under jit such a frame adds nothing, and
-    the edge of the voxels becomes NaN, and so every score from then on.
+    Poses that are not rigid are refused outside jit. Under jit such a frame adds nothing, and the
+    voxel size becomes NaN, and so does every later score.
 
     Args:
         state: the map before the frame.
         frame: the frame. Depth 0 (no measurement) and inf (out of range) are ignored.
         max_range: measurements beyond this z-depth are ignored, and so are voxels farther away [m].
-        drop_edges: False lets pixels on depth edges in.
-        donate: True updates the table in place: `state` must not be used again. The cost then
-            does not grow with the capacity, where a copy of a million rows takes 15 ms.
+        drop_edges: False keeps pixels on depth edges.
+        donate: True updates the table in place:
+            `state` must not be used again. The cost then does not grow with the capacity, where a
+            copy of a million rows takes 15 ms.
 
     Raises:
-        TypeError: no map, or no frame.
-        ValueError: a range that is not positive, a camera so far from the origin that voxels have
-            no index (where they are known, that is outside jit); several maps or frames at once,
-            without `jax.vmap`.
+        TypeError: not a map, or not a frame.
+        ValueError: a range that is not positive, a camera too far from the origin for voxel indices
+            (both checked outside jit); several maps or frames at once, without `jax.vmap`.
     """
-    # Only where values are known can they be refused.
+    # Values can only be refused where they are known.
     if not is_traced(max_range) and not float(max_range) > 0.0:
         raise InputError(f"max_range must be positive [m], got {float(max_range)}")
     if not is_traced(frame.T_world_camera, state.voxel_size):
@@ -254,9 +254,9 @@ def integrate(
 
 
 def _check_in_reach(state: MapState, frame: Frame) -> None:
-    """Refuses a camera in whose surroundings voxels have no index."""
+    """Refuses a camera too far from the origin for voxel indices."""
     position = np.asarray(frame.T_world_camera)[:3, 3]
-    # Near the origin small voxels have one, too, and the map's size need not be waited for.
+    # Near the origin even small voxels have indices: no need to wait for the map's voxel size.
     if np.abs(position).max(initial=0.0) > _NEAR:
         limit = 0.99 * INDEX_LIMIT * float(state.voxel_size)
         check_near_origin("T_world_camera", position, limit)
@@ -278,8 +278,8 @@ def integrate_growing(
         state: the map before the frame.
         frame: the frame.
         max_range: as in `integrate` [m].
-        allow_growth: False keeps the capacity; what finds no row is counted in `dropped`.
-        drop_edges: False lets pixels on depth edges in.
+        allow_growth: False keeps the capacity; voxels beyond it are counted in `dropped`.
+        drop_edges: False keeps pixels on depth edges.
     """
     if not allow_growth:
         return integrate(state, frame, max_range, drop_edges)
@@ -289,25 +289,25 @@ def integrate_growing(
 def update_growing(
     update: Callable[[MapState], MapState], state: MapState, most_rows: int | None = None
 ) -> MapState:
-    """Updates a map, in a table twice as large for as long as the update overfills it.
+    """Updates a map, and doubles its table until the update fits.
 
     Args:
         update: a pure function that adds to a map.
         state: the map before.
-        most_rows: the table becomes no larger; None: as large as it needs to be.
+        most_rows: maximum number of rows; None: no limit.
 
     Raises:
-        ValueError: it would become larger.
+        ValueError: more rows would be needed.
     """
-    # Tried first, grown after: almost every frame fits, and asking costs as much as adding.
+    # Add first, grow afterwards: almost every frame fits, and checking costs as much as adding.
     after = update(state)
-    # Also while something was dropped: a long probe sequence may fail below the limit.
+    # Also if something was dropped: a long probe sequence may fail below the limit.
     while int(after.num_occupied) > _MAX_LOAD * after.capacity or int(after.dropped) > int(
         state.dropped
     ):
         if most_rows is not None and state.capacity >= most_rows:
             raise InputError(f"the map would need more than {most_rows} rows")
-        # From the state before the update: what was dropped is then not lost.
+        # From the state before the update, so that dropped voxels are not lost.
         state = grow(state, 2 * state.capacity)
         after = update(state)
     return after
@@ -325,7 +325,7 @@ def _integrate_points(
     valid = valid & jnp.all(jnp.isfinite(points_world), axis=1)
     if camera_position.ndim == 2:
         valid = valid & jnp.all(jnp.isfinite(camera_position), axis=1)
-    # NaN in padding would poison gradients and indices even where it is masked.
+    # NaN in padding would spread to gradients and indices even if masked.
     points = jnp.where(valid[:, None], points_world, 0.0)
     groups = group_by_voxel(points.T, rgb, valid, state.voxel_size)
     if camera_position.ndim == 2:
@@ -343,30 +343,28 @@ def integrate_points(
     *,
     valid: ArrayLike | None = None,
 ) -> MapState:
-    """Adds the points seen by one camera, or by a scanner, to the map.
+    """Integrates the points seen by one camera, or by a scanner, into the map.
 
-    This is `integrate` for points.
-
-    One call is one look: a voxel gets one observation, however many points fall into it. A LiDAR
-    has rays instead of pixels: its `focal` is one over the angle between neighboring rays [1/rad],
-    which gives points per meter where a camera gives pixels per meter. While it turns, it may move:
-    each point may have its own sensor position, and a voxel is seen from the mean of its points'.
-    So cut a long recording into scans; a colorless scanner's intensity, three times, will do.
-
-    Arrays of NumPy and JAX are welcome; shapes and values are checked here. Compiled on first use
-    for each number of points and capacity: pad scans to one length, and mask the padding out.
+    This is `integrate` for points. One call is one observation of each touched voxel, however many
+    points fall into it. A LiDAR has rays instead of pixels: its `focal` is one over the angle
+    between neighboring rays [1/rad], which gives points per meter where a camera gives pixels per
+    meter. A scanner may move while it turns: each point may have its own sensor position, and a
+    voxel counts as seen from the mean position of its points. So split a long recording into scans.
+    If the scanner has no color, repeat its intensity three times. Takes arrays of NumPy and JAX,
+    and checks their shapes and values. Compiled on first use for each number of points and
+    capacity: pad scans to one length, and mask the padding out.
 
     Args:
         state: the map before.
         points_world: points [m], world, [P, 3].
         rgb: their colors in [0, 1], [P, 3].
-        camera_position: where the camera or scanner was [m]: [3], or [P, 3] for each point.
+        camera_position: position of the camera or scanner [m]: [3], or [P, 3] for each point.
         focal: focal length [px]; with 1.0 the resolution is the paper's 1 / distance.
-        valid: False for padding, whatever stands there, [P] bool. None: every point counts.
+        valid: False for padding, which may hold anything, [P] bool. None: every point counts.
 
     Raises:
         ValueError: shapes that do not fit; values that are not finite or colors outside [0, 1]
-            (where they are known, that is outside jit).
+            (checked outside jit).
     """
     points_world, rgb = jnp.asarray(points_world, dtype=jnp.float32), jnp.asarray(rgb)
     camera_position = jnp.asarray(camera_position, dtype=jnp.float32)
@@ -374,7 +372,7 @@ def integrate_points(
     _check_shapes(points_world, rgb, camera_position, focal)
     num = points_world.shape[0]
     mask = jnp.ones(num, dtype=bool) if valid is None else jnp.asarray(valid)
-    # Integers are refused: indices of points would pass for a mask otherwise.
+    # Integers are refused: they could be indices of points instead of a mask.
     if mask.shape != (num,) or mask.dtype != jnp.bool_:
         raise InputError(f"valid must be [{num}] bool, got {mask.dtype} of shape {mask.shape}")
     if not is_traced(points_world, rgb, camera_position, focal, mask):

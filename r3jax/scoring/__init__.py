@@ -1,1 +1,1 @@
-"""How well a view could be rendered, and what it would add: the closed forms."""
+"""Closed forms: how well a view could be rendered, and what it would add to the map."""

@@ -1,7 +1,7 @@
-"""Scores of many candidates against one map: the inner loop of planning.
+"""Scores many candidates against one map: the inner loop of planning.
 
-One call scores all candidates. Where there are several devices, they share the candidates; what has
-no kernel for CPUs, and so runs on one core, is dealt out to as many threads as the process may use.
+One call scores all candidates. Several devices share the candidates; a score without a CPU kernel,
+which would use one core, is split over threads.
 
 Shape symbols: C candidates; n voxels; c cells; B bins of the panorama.
 """
@@ -78,7 +78,7 @@ def _at_hand(
 ) -> tuple[MapState, Cells]:
     """Returns the whole map and grid if a kernel culls them itself, else the rows within range."""
     if is_traced(state.key, positions):
-        raise TypeError("score_views and score_positions deal out work: call them outside jit")
+        raise TypeError("score_views and score_positions distribute work: call them outside jit")
     if jax.default_backend() == "cpu" and can_call_kernels():
         return state, _cells_of(grid)
     voxels, cells, _ = gather_in_range(state, grid, positions, config)
@@ -139,7 +139,7 @@ def score_cached_near(
 ) -> Panorama:
     """Updates `score_positions_near` after imagined views, from the cache before them.
 
-    `threads` is that of `map_over_devices`: 1 for who calls from threads.
+    `threads` is passed to `map_over_devices`: 1 if the caller is itself a thread.
     """
     score = functools.partial(_score_cached, before, after, camera, config)
     places = (kept, positions, _all_if_none(allowed, positions, config))
@@ -153,7 +153,7 @@ def _all_if_none(
 ) -> Bool[Array, "C B"]:
     """Returns the allowed axes; all if `allowed` is None."""
     if allowed is None:
-        # All true, not None: the same compiled program then serves calls with and without a choice.
+        # All true, not None: one compiled program then serves calls with and without `allowed`.
         allowed = np.ones((positions.shape[0], config.panorama_bins), dtype=bool)
     return jnp.asarray(allowed)
 
@@ -215,13 +215,13 @@ def map_over_devices(
     devices: Sequence[Any] | None = None,
     threads: int | None = None,
 ) -> Scores:
-    """Scores candidates in equal shares on all devices; a CPU alone: on all of its cores.
+    """Scores candidates in equal shares on all devices, or on all cores of a single CPU.
 
     Args:
-        score: of any number of candidates; a jitted function with all but the last argument.
-        candidates: what to score.
-        devices: of JAX, where to; by default all of this process.
-        threads: at most, on a CPU alone; 1 for a `score` that shares its work out by itself.
+        score: a jitted function of any number of candidates, other arguments already bound.
+        candidates: the candidates.
+        devices: JAX devices to use; by default all of this process.
+        threads: maximum on a single CPU; 1 for a `score` that is parallel itself.
     """
     num = jax.tree.leaves(candidates)[0].shape[0]
     devices = (jax.local_devices() if devices is None else devices)[:num]

@@ -1,4 +1,4 @@
-"""Settings of every score. Numbers are traced, so a sweep over them compiles once."""
+"""Settings of the scores. Numbers are traced, so that a sweep over them compiles once."""
 
 from typing import Any
 
@@ -14,25 +14,25 @@ from r3jax.mapping.state import a_map
 from r3jax.visibility.config import VisibilityConfig, as_float32
 
 PAPER = Forms()
-"""What the paper's equations and algorithms say."""
+"""The paper's equations and algorithms."""
 
 
 class ScoringConfig(VisibilityConfig):
-    """What the closed forms and the utilities leave open, beside what visibility does."""
+    """Settings of the closed forms and the utilities, beside those of visibility."""
 
     lambda1: Float[Array, ""] = eqx.field(default=16.0, converter=as_float32)
-    """Weight of one visible unexplored cell against one voxel that renders badly. A cell of 0.2 m
-    hides a surface of about 4 x 4 voxels of 5 cm; with 1 a run through a large house stays in
-    the first rooms."""
+    """Weight of a visible unexplored cell relative to a voxel with R = 0. A cell of 0.2 m hides a
+    surface of about 4 x 4 voxels of 5 cm; with a weight of 1, runs through a large house do not
+    leave the first rooms."""
 
     kappa: str = eqx.field(default="box", static=True)
-    """`box`: 1 inside the seen directions' box, else 2. `one`: always 1."""
+    """`box`: 1 inside the bounding box of the seen directions, else 2. `one`: always 1."""
 
     delta: str = eqx.field(default="trace", static=True)
     """`trace`: the paper's Algorithm 2. `pairwise`: its text, 1 - 2 tr(M) / (n - 1)."""
 
     panorama_bins: int = eqx.field(default=526, static=True)
-    """Directions of the panorama; 526 are 10 degrees apart."""
+    """Number of directions of the panorama; 526 are 10 degrees apart."""
 
     @property
     def forms(self) -> Forms:
@@ -40,22 +40,22 @@ class ScoringConfig(VisibilityConfig):
         return Forms(self.kappa, self.delta)
 
     def __check_init__(self) -> None:
-        """Refuses settings that no formula knows."""
+        """Refuses invalid settings."""
         if self.kappa not in ("box", "one"):
             raise InputError(f"kappa must be 'box' or 'one', got {self.kappa!r}")
         if self.delta not in ("trace", "pairwise"):
             raise InputError(f"delta must be 'trace' or 'pairwise', got {self.delta!r}")
-        # A traced weight has no value yet.
+        # A traced weight has no value to check.
         if not is_traced(self.lambda1) and not np.isfinite(self.lambda1).all():
             raise InputError(f"lambda1 (--lambda1) must be finite in float32, got {self.lambda1}")
 
 
 RETIRED = {"sample": "it was off, and no table rests on it; commit 4fa1d20 has it"}
-"""Settings that have left the package: the reason, and where their code is."""
+"""Removed settings: why they were removed, and the commit with their code."""
 
 
 def scoring_config_of(settings: dict[str, Any]) -> ScoringConfig:
-    """Makes the settings of a record or of a command.
+    """Makes the settings from those of a record or a command.
 
     Raises:
         ValueError: no setting has one of these names (any more), or a value is impossible.
@@ -69,4 +69,4 @@ def scoring_config_of(settings: dict[str, Any]) -> ScoringConfig:
 scoring_settings = or_none(one(ScoringConfig, "None: its defaults"))
 
 checked_view = checked(state=a_map, camera=a_camera, T_world_camera=a_pose, config=scoring_settings)
-"""Decorates a question about one view of a map with checks of its arguments."""
+"""Decorates a score of one view of a map with checks of its arguments."""

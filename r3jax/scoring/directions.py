@@ -1,4 +1,4 @@
-"""What the visited direction bins say about a new direction: the angle term and kappa's box.
+"""Compares a new direction with the visited direction bins: the angle term and kappa's box.
 
 Shape symbols: n voxels; W words of bins; B bins.
 """
@@ -26,9 +26,9 @@ def seen_directions(
         inside = 1 if the origin lies in the bounding box of the bins with <q_k, r> > 0,
                  projected on the tangent plane at r; else 0
 
-    Only signs of the tangent coordinates matter for the box, so the axes up x r and
-    r x (up x r) are left unnormalized. The bins are looped over, the voxels vectorized: the
-    arithmetic, some 20 operations per bin and voxel, is all the cost.
+    Only signs of the tangent coordinates matter for the box, so the axes up x r and r x (up x r)
+    are left unnormalized. The loop runs over bins and is vectorized over voxels; its cost is about
+    20 operations per bin and voxel.
 
     Args:
         visited: bit `k % 32` of word `k // 32` for each visited bin k.
@@ -39,8 +39,8 @@ def seen_directions(
         `cosine` and `inside`. The derivative of `cosine` is that of the nearest bin's product;
         `inside` is piecewise constant.
     """
-    # One array of pairs behind a branch: XLA on a CPU would otherwise repeat the whole scan over
-    # the bins in every kernel that uses one of its results.
+    # One array of pairs behind a branch: otherwise XLA on a CPU would fuse, and so repeat, the scan
+    # over the bins into every kernel that uses one of its results.
     pairs = jax.lax.cond(
         jnp.any(visited != jnp.uint32(0)),
         lambda: jax.lax.complex(*_scan(visited, direction, num_bins)[:2]),
@@ -83,7 +83,7 @@ def nearest_seen(
     return best
 
 
-# Jitted: a thousand operations are then traced once for a size, not once for every program.
+# Jitted: a thousand operations are then traced once per size, not once per program.
 @functools.partial(jax.jit, static_argnames=("num_bins", "keep_nearest"))
 def _scan(
     visited: UInt32[Array, "W n"],
@@ -97,13 +97,13 @@ def _scan(
     # Tangent axes: a = up x r = (-y, x, 0), or the x axis at the poles; b = r x a.
     a_x, a_y = jnp.where(is_pole, 1.0, -y), jnp.where(is_pole, 0.0, x)
     b_x, b_y, b_z = -z * a_y, z * a_x, x * a_y - y * a_x
-    # A voxel without bins keeps -1, which the clamp turns into 0: nothing resembles the new view.
+    # A voxel without bins keeps -1, which the clamp turns into 0.
     lowest, zero = jnp.full_like(x, -1.0), jnp.zeros_like(x)
     best, nearest = lowest, (zero, zero, zero)
-    # Empty boxes are turned inside out: the origin lies in none of them.
+    # Empty boxes have inverted bounds, so that they do not contain the origin.
     a_low = b_low = jnp.full_like(x, jnp.inf)
     a_high = b_high = jnp.full_like(x, -jnp.inf)
-    # Python's floats: the lattice becomes literals of the program, and no gather is needed.
+    # Python floats: the lattice becomes constants of the program, without a gather.
     for k, (q_x, q_y, q_z) in enumerate(fibonacci_lattice(num_bins).astype("float32").tolist()):
         is_visited = (visited[k // 32] & jnp.uint32(1 << (k % 32))) != jnp.uint32(0)
         cosine = jnp.where(is_visited, q_x * x + q_y * y + q_z * z, -1.0)

@@ -1,11 +1,11 @@
-"""Why a view is worth what it is worth: its utility, divided among four causes.
+"""Explains the utility of a view: divides it among four causes.
 
     U = lambda1 U_G + sum of (1 - R),    R = bias x noise x resolution        (arXiv 2601.07484)
 
 The first term is space that was never seen. The deficit of a visible voxel, 1 - R, is divided among
-the factors of R in proportion to their logarithms, because these add up to that of R. A factor
-of 1 so takes nothing, the order of the factors makes no difference, and a factor that falls to 0
-takes all: the limit of the rule, so no floor is needed. The paper has no such division.
+the factors of R in proportion to their logarithms, which add up to the logarithm of R. So a factor
+of 1 gets nothing, a factor of 0 gets everything, and the order of the factors makes no difference.
+The division is not in the paper.
 
 Shape symbols: n voxels; F factors; N capacity of the map; X Y Z cells of the grid.
 """
@@ -26,30 +26,30 @@ from r3jax.scoring.terms import score_voxels
 from r3jax.visibility.views import pinhole_view
 
 CAUSES = ("never seen", "too oblique", "inconsistent", "too far")
-"""What a utility comes from: unexplored cells, then the factors bias, noise and resolution."""
+"""The causes: unexplored cells, then the factors bias, noise and resolution."""
 
 _LEAST = float(jnp.finfo(jnp.float32).tiny)
-"""What is smaller has no logarithm on every device: it counts as 0."""
+"""Smaller factors count as 0: some devices flush them to zero before taking the logarithm."""
 
 _Sums = tuple[Float[Array, "3 N"], Float[Array, " 3"]]
 """Shares of every row, and their totals."""
 
 
 class Explanation(eqx.Module):
-    """What a view promises (`ViewUtility`), by cause, in the order of `CAUSES`."""
+    """The utility of a view (`ViewUtility`) by cause, in the order of `CAUSES`."""
 
     totals: Float[Array, " 4"]
     """Shares of the whole view; they sum to its utility lambda1 U_G + U_R."""
 
     shares: Float[Array, "3 N"]
-    """Shares of each row of the map: too oblique, inconsistent, too far. They sum to the 1 - R of
-    a row that the view sees, and are 0 for the others."""
+    """Shares of each row of the map: too oblique, inconsistent, too far. They sum to 1 - R for
+    visible rows, and are 0 for all others."""
 
     visible: Bool[Array, " N"]
     """Rows that the view sees."""
 
     cells: Bool[Array, "X Y Z"]
-    """Unexplored cells that the view sees: each is lambda1 of what was never seen."""
+    """Unexplored cells that the view sees; each adds lambda1 to the first cause."""
 
 
 @checked(state=a_map, grid=a_grid, camera=a_camera, T_world_camera=a_pose, config=scoring_settings)
@@ -63,8 +63,8 @@ def explain_view(
 ) -> Explanation:
     """Divides the utility of one view among its causes, for every voxel and in total.
 
-    It sees what `view_utility` of the same view sees. A voxel that was observed once only is
-    never called inconsistent: nothing was measured against it.
+    It sees what `view_utility` of the same view sees. A voxel observed only once is never called
+    inconsistent: there is nothing to compare it with.
 
     Args:
         state: the map.
@@ -104,7 +104,7 @@ def _divide_visible(
         terms = score_voxels(voxels.take(index, valid), position, focal, forms)
         factors = jnp.stack([terms.bias, terms.noise, terms.resolution])
         part = jnp.where(valid[None, :], attribute_deficit(1.0 - terms.value, factors), 0.0)
-        target = jnp.where(valid, index, num)  # out of range on purpose: dropped
+        target = jnp.where(valid, index, num)  # out of range, so dropped
         return shares.at[:, target].set(part, mode="drop"), totals + jnp.sum(part, axis=1)
 
     start = jnp.zeros((3, num), dtype=jnp.float32), jnp.zeros(3, dtype=jnp.float32)
@@ -116,8 +116,8 @@ def attribute_deficit(
 ) -> Float[Array, "F n"]:
     """Attributes the deficit 1 - prod(f) to the factors, in proportion to -log f.
 
-    share of f = deficit log(f) / sum of the logarithms; if factors are 0, they share alike, and
-    the others take nothing.
+    share of f = deficit log(f) / sum of the logarithms. Factors of 0 share the deficit equally, and
+    the others get nothing.
 
     Args:
         deficit: 1 - the product of the factors.

@@ -1,7 +1,7 @@
-"""What a view shows of a map, by the paper's formulas, in plain JAX.
+"""The paper's formulas in plain JAX, summed over what a view shows.
 
-Differentiable with respect to the position, the focal length and what is known of the voxels;
-what is visible is held fixed. The kernels are held to this.
+Differentiable with respect to the position, the focal length and the voxels' statistics; visibility
+is held fixed. Tests compare the kernels with these formulas.
 
 Shape symbols: n voxels; c cells; B bins of the panorama; h w pixels of the depth buffer.
 """
@@ -37,8 +37,8 @@ def sums_in_view(
     Args:
         voxels: of the map.
         cells: of the grid.
-        view: what is looked at.
-        position: of the camera: that of the view, with the derivative [m].
+        view: the view.
+        position: camera center, equal to the view's; carries the derivative [m].
         focal: focal length of R [px].
         config: settings.
         num_bins: bins of the Fibonacci lattice; 1 sums over all directions.
@@ -56,7 +56,7 @@ def sums_of_seen(
     forms: Forms,
     num_bins: int,
 ) -> tuple[Float[Array, " B"], Float[Array, " B"]]:
-    """Computes `sums_in_view` of voxels and cells that are known to be seen."""
+    """Computes `sums_in_view` for known visibility."""
     deficit = 1.0 - score_voxels(voxels, position, focal, forms).value
     deficit, unexplored = jnp.where(seen[0], deficit, 0.0), seen[1].astype(jnp.float32)
     points = jnp.stack([cells.x, cells.y, cells.z])
@@ -75,19 +75,19 @@ def change_of_sums(
     forms: Forms,
     num_bins: int,
 ) -> tuple[Float[Array, " B"], Float[Array, " B"]]:
-    """Sums the changes of `sums_in_view` by imagined views where the same is seen.
+    """Computes how imagined views change `sums_in_view`; visibility stays the same.
 
     Args:
         before: voxels and cells before the views.
         after: the same after them (`simulated.simulate_view_near`).
-        kept: which voxels and which cells are seen, as bits in bytes.
+        kept: visible voxels and cells, as bits in bytes.
         position: of the camera [m].
         focal: focal length of R [px].
         forms: of kappa and delta.
         num_bins: bins of the Fibonacci lattice.
 
     Returns:
-        Sums of 1 - R after less before, and numbers of cells that are no longer unexplored.
+        Differences of the sums of 1 - R, and numbers of cells that are no longer unexplored.
     """
     (voxels, cells), (voxels_after, cells_after) = before, after
     seen, empty = (
@@ -117,7 +117,7 @@ def seen_in_view(
 
 
 def rows_in_pixels(voxels: MapState, view: View) -> Int[Array, "h w"]:
-    """Finds the row of the voxel that each pixel of a view shows; n where it shows none."""
+    """Finds the row of the voxel in each pixel of a view; n where there is none."""
     return depth_buffer(voxels.voxels, view, VisibilityConfig()).row
 
 
@@ -128,7 +128,7 @@ def mean_in_pixels(
     focal: Float[Array, ""],
     forms: Forms,
 ) -> Float[Array, ""]:
-    """Averages R of the voxel that each pixel shows; 0 where it shows none."""
+    """Averages R over the pixels of a view; pixels without a voxel count as 0."""
     return mean_of_rows(voxels, rows_in_pixels(voxels, view), position, focal, forms)
 
 
@@ -139,7 +139,7 @@ def mean_of_rows(
     focal: Float[Array, ""],
     forms: Forms,
 ) -> Float[Array, ""]:
-    """Averages R of the voxels in the pixels of an image; 0 where there is none."""
+    """Averages R over the pixels of an image; pixels without a voxel count as 0."""
     shown = voxels_of_rows(voxels, rows)
     return jnp.mean(score_voxels(shown, position, focal, forms).value)
 
@@ -166,7 +166,7 @@ def sum_by_direction(
     position: Float[Array, " 3"],
     num_bins: int,
 ) -> Float[Array, " B"]:
-    """Sums weights into the bins in which points lie, seen from a position.
+    """Sums the weights of points by direction bin, as seen from a position.
 
     A single bin sums all weights.
     """

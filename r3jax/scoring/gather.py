@@ -1,6 +1,6 @@
-"""What candidates may see at all, gathered once for all of them.
+"""Gathers, once for all candidates, the voxels and cells that any of them may see.
 
-Candidates of a step lie close together: what none of them can see is left out.
+Candidates of a step lie close together, so that this leaves out most of a large map.
 
 Shape symbols: C candidates; n voxels; c cells.
 """
@@ -21,9 +21,8 @@ from r3jax.scoring.config import ScoringConfig
 from r3jax.visibility.views import Coordinates
 
 SMALLEST = 1 << 16
-"""Voxels at hand are padded to this or 4, 16, ... times as many: a run compiles once for each pair
-of sizes, of voxels and of cells, that it meets, which takes seconds and memory for good.
-Absent ones cost little."""
+"""Gathered voxels are padded to this number or 4, 16, ... times it. Each pair of sizes is compiled
+once, which takes seconds and memory; padding costs little."""
 
 
 def gather_in_range(
@@ -35,7 +34,7 @@ def gather_in_range(
         Voxels and cells, padded with absent ones, and each voxel's row in the map (N: padding).
     """
     if is_traced(state.key, positions):
-        raise TypeError("score_views and score_positions choose sizes: call them outside jit")
+        raise TypeError("score_views and score_positions choose array sizes: call them outside jit")
     # The box round all positions: one test per voxel, however many candidates there are.
     places = np.asarray(positions)
     low, high = places.min(axis=0), places.max(axis=0)
@@ -48,7 +47,7 @@ def gather_in_range(
 def _sizes(voxels: int, cells: int, capacity: int, num_cells: int) -> tuple[int, int]:
     """Rounds numbers of voxels and cells up to one of a few pairs.
 
-    The cells get as much as the voxels, or all that there are.
+    Cells are padded to the voxels' size, or to all cells of the grid if that is less.
     """
     room = SMALLEST
     while room < min(voxels, capacity):
@@ -66,14 +65,14 @@ def _masks(
     """Finds voxels and unexplored cells within range of a box."""
 
     def is_near(points: Coordinates, margin: Float[Array, ""] | float) -> Bool[Array, " k"]:
-        # To the box it is no farther than to a position in it: nothing in range is lost.
+        # The distance to the box is at most that to any position in it: nothing in range is lost.
         gap = [
             jnp.maximum(jnp.maximum(low[i] - points[i], points[i] - high[i]), 0.0) for i in range(3)
         ]
         reach = config.max_range + margin
         return gap[0] * gap[0] + gap[1] * gap[1] + gap[2] * gap[2] <= reach * reach
 
-    # With a voxel as margin: the same voxels hide as if the whole map were at hand.
+    # A margin of one voxel: occlusion is the same as with the whole map.
     near_voxels = voxels.present & is_near(voxels.center, voxels.voxel_size)
     near_cells = cells.unexplored & is_near((cells.x, cells.y, cells.z), 0.0)
     return near_voxels, near_cells

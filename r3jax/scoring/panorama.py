@@ -1,4 +1,4 @@
-"""The panorama of a position: every direction's worth at once, and the best one.
+"""The panorama of a position: the utility of every direction at once, and the best one.
 
 Shape symbols: B bins of the panorama.
 """
@@ -23,8 +23,8 @@ class Panorama(eqx.Module):
     """Scores of all directions from one position."""
 
     bin_scores: Float[Array, " B"]
-    """Per bin: the sum of lambda1 over its visible unexplored cells and of (1 - R), or of the
-    gain for a demand, over its visible voxels."""
+    """Per bin: lambda1 times its visible unexplored cells, plus the sum of (1 - R) over its visible
+    voxels."""
 
     direction_scores: Float[Array, " B"]
     """Per camera axis q_k: the sum of the bins inside the camera's field of view."""
@@ -33,7 +33,7 @@ class Panorama(eqx.Module):
     """The allowed axis with the largest score; unit length."""
 
     best_score: Float[Array, ""]
-    """Its score: lambda1 U_G + U_R (or the gain) of that view, to the resolution of the bins."""
+    """Its score: lambda1 U_G + U_R of that view, to the resolution of the bins."""
 
     T_world_camera: Float[Array, "4 4"]
     """The roll-free pose at the position that looks along the best direction."""
@@ -72,7 +72,7 @@ def panorama_of(
     config: ScoringConfig,
     allowed: Bool[Array, " B"] | None = None,
 ) -> Panorama:
-    """Computes `panorama` of voxels and cells that were already gathered.
+    """Computes `panorama` from gathered voxels and cells.
 
     Args:
         voxels: of the map.
@@ -100,14 +100,14 @@ def panorama_of_bins(
     """Builds the panorama whose bins have these scores."""
     num_bins = config.panorama_bins
     directions = bins_in_view(camera, num_bins) @ bins
-    # Of equal scores the first wins: the choice can be repeated.
+    # Ties go to the first, so that the choice is repeatable.
     best = jnp.argmax(directions if allowed is None else jnp.where(allowed, directions, -jnp.inf))
     axis = jnp.asarray(fibonacci_lattice(num_bins), dtype=jnp.float32)[best]
     return Panorama(bins, directions, axis, directions[best], pose_along(position, axis))
 
 
 def bins_in_view(camera: Camera, num_bins: int) -> Float[Array, "B B"]:
-    """Marks by 1 the bins j in the roll-free, rectangular field of view with axis q_k: N(k)."""
+    """Computes N(k): 1 for the bins j in the roll-free, rectangular field of view along q_k."""
     lattice = jnp.asarray(fibonacci_lattice(num_bins), dtype=jnp.float32)
     R = jax.vmap(lambda q: pose_along(jnp.zeros(3, dtype=jnp.float32), q)[:3, :3])(lattice)
     x, y, z = jnp.einsum("kij,bi->jkb", R, lattice)

@@ -1,8 +1,8 @@
-"""Panoramas that are kept, to be scored again after views that are only imagined.
+"""Caches panoramas, to update them after imagined views.
 
-Such views (`scoring.simulated`) change what voxels are worth and which cells are left to explore,
-but no surface: what a position sees stays, and finding that is most of what a panorama takes. So
-a search over paths finds it once, and again adds up only what has changed.
+Imagined views (`scoring.simulated`) change the R of voxels and the unexplored cells, but no
+surface: visibility, the most expensive part of a panorama, stays the same. So a search over paths
+determines visibility once and then only updates the sums.
 
 Shape symbols: n voxels; c cells; p and q their bits, packed in bytes; B bins of the panorama.
 """
@@ -22,7 +22,7 @@ from r3jax.visibility.views import panorama_view
 
 
 class PanoramaCache(eqx.Module):
-    """What is kept of a panorama, or of many: a bit for every voxel and cell at hand."""
+    """The cache of one or many panoramas: a bit for every gathered voxel and cell."""
 
     bin_scores: Float[Array, "*positions B"]
     """As in `Panorama`."""
@@ -67,18 +67,18 @@ def panorama_from_cache(
     """Updates `panorama_of` after imagined views, from the cache before them.
 
     Args:
-        kept: of this position, before.
-        before: voxels and cells that it was kept of.
+        kept: the cache of this position.
+        before: the voxels and cells that it was computed from.
         after: the same after any number of imagined views (`simulate_view_near`).
         camera: whose field of view and focal length count.
         position: camera center [m].
-        config: as when it was kept.
+        config: as for the cache.
         allowed: as in `panorama_of`.
     """
     seen = (kept.voxels, kept.cells)
     change, gone = change_of_sums(
         before, after, seen, position, camera.focal, config, config.panorama_bins
     )
-    # A difference of sums may end just below 0 by rounding, which no bin is worth.
+    # Rounding may leave a difference of sums just below 0.
     bins = jnp.maximum(kept.bin_scores + change - config.lambda1 * gone, 0.0)
     return panorama_of_bins(bins, camera, position, config, allowed)

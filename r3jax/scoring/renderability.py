@@ -45,7 +45,7 @@ def voxel_renderability(
     Args:
         state: the map.
         camera_position: [3] [m], world.
-        focal: focal length of the camera that asks [px], one number.
+        focal: focal length of the camera [px], one number.
         kappa: `box`, or `one` to leave the box test out.
 
     Returns:
@@ -68,22 +68,22 @@ def voxel_renderability(
 
 
 class TermImages(eqx.Module):
-    """What one view shows of the map, pixel by pixel; every term is 0 where it shows nothing."""
+    """The terms of renderability pixel by pixel; all are 0 where a pixel shows no voxel."""
 
     row: Int[Array, "h w"]
-    """Row of the voxel that a pixel sees; the map's capacity where it sees none."""
+    """Row of the voxel in each pixel; the map's capacity where there is none."""
 
     value: Float[Array, "h w"]
     """R, the product of the terms."""
 
     bias: Float[Array, "h w"]
-    """b: the angle to the nearest direction that the voxel was seen from."""
+    """b: from the angle to the nearest direction from which the voxel was seen."""
 
     noise: Float[Array, "h w"]
     """eps: the consistency of its color."""
 
     resolution: Float[Array, "h w"]
-    """gamma: the sharpness that it was seen with."""
+    """gamma: the resolution at which it was seen."""
 
 
 @checked_view
@@ -94,9 +94,9 @@ def term_images(
     T_world_camera: Float[Array, "4 4"],
     config: ScoringConfig | None = None,
 ) -> TermImages:
-    """Computes R and its terms, of the voxel that each pixel of one view sees.
+    """Computes R and its terms for the voxel in each pixel of a view.
 
-    In the pixels of `renderability_image`, and differentiable as it is.
+    Uses the pixels of `renderability_image`, and is differentiable in the same sense.
     """
     config = ScoringConfig() if config is None else config
     view = pinhole_view(camera, T_world_camera, config)
@@ -119,11 +119,11 @@ def renderability_image(
     T_world_camera: Float[Array, "4 4"],
     config: ScoringConfig | None = None,
 ) -> Float[Array, "h w"]:
-    """Computes R of the voxel that each pixel of one view sees; 0 where it sees none.
+    """Computes R of the voxel in each pixel of a view; 0 where there is none.
 
-    The image is a depth buffer of the voxels, at most `config.zbuffer_size` pixels wide or
-    high, with the camera's field of view. Differentiable with respect to the pose: which voxel
-    a pixel sees is held fixed, its R varies. One of `term_images`.
+    The image is a depth buffer of the voxels, at most `config.zbuffer_size` pixels wide or high,
+    with the camera's field of view. Differentiable with respect to the pose: the voxel in each
+    pixel is held fixed, its R varies. This is one of the `term_images`.
     """
     return term_images(state, camera, T_world_camera, config).value
 

@@ -1,7 +1,7 @@
 """Scores candidates on several devices at once: each has the whole map and an equal share of them.
 
-The scores of a share are a loop over its candidates, which the partitioner of jit would run on
-every device for all of them; `shard_map` runs each share where it lies.
+A share is a loop over its candidates. The partitioner of jit would run all of it on every device;
+`shard_map` runs each share on its own device.
 
 Shape symbols: C candidates; D devices; P candidates padded to a multiple of D.
 """
@@ -29,7 +29,7 @@ def padded_to(multiple: int, candidates: Candidates) -> Candidates:
     def pad(rows: Array) -> Array:
         missing = -rows.shape[0] % multiple
         if missing == 0:
-            return rows  # not copied: the bits of a hundred panoramas are megabytes
+            return rows  # not copied: caches of a hundred panoramas take megabytes
         last = jnp.broadcast_to(rows[-1:], (missing, *rows.shape[1:]))
         return jnp.concatenate([rows, last])
 
@@ -44,19 +44,19 @@ def score_on_devices(
 ) -> Any:
     """Computes `score(*known, candidates)` with the candidates spread over the devices.
 
-    Each candidate's score is computed as on one device: the numbers are the same, but for last
-    bits where a share is a single candidate, whose loop XLA unrolls and fuses otherwise.
+    Each candidate's score is computed as on one device: the numbers are equal, except for the last
+    bits if a share is a single candidate, whose loop XLA unrolls and fuses differently.
 
     Args:
         score: a module-level function of `known` and of any number of candidates, so that it
             compiles once; gives fields of shape [C, ...].
-        known: the same for all candidates, copied to each device; what is no number or array,
-            such as a function, stays as it is.
-        candidates: what to score.
+        known: the same for all candidates, copied to each device; other values than numbers and
+            arrays, such as functions, are passed unchanged.
+        candidates: the candidates.
         devices: of JAX, all of one kind.
 
     Returns:
-        Fields of shape [P, ...], D shards along the first axis; what is behind C is padding.
+        Fields of shape [P, ...], D shards along the first axis; rows from C on are padding.
     """
     mesh = Mesh(np.asarray(devices), (_AXIS,))
     apart = NamedSharding(mesh, PartitionSpec(_AXIS))
@@ -81,7 +81,7 @@ def _score(
         return score(*eqx.combine(arrays, others), share)
 
     split = PartitionSpec(_AXIS)
-    # The loops inside start from constants, which are the same everywhere, and end in what is not.
+    # The loops inside start from replicated constants and end in values that vary by device.
     spread = jax.shard_map(
         own, mesh=mesh, in_specs=(PartitionSpec(), split), out_specs=split, check_vma=False
     )

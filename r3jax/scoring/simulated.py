@@ -1,15 +1,15 @@
-"""The map as it would be after a view that is not taken yet.
+"""Predicts the map after a view that has not been taken.
 
-A hypothetical observation of every voxel that the view would show:
+Each voxel that the view would show gets a hypothetical observation:
 
     bins        the bin towards the camera joins them
     resolution  focal / distance, if that is better
     count       n + 1
-    m2          m2 n / (n - 1) for n > 1: the variance m2 / (n - 1) stays, as it would on average if
-                the new color scattered like the others. A view cannot talk noise away.
+    m2          m2 n / (n - 1) for n > 1: the variance m2 / (n - 1) stays, as expected if the new
+                color scatters like the others: imagined views do not reduce noise
 
-Colors and surfaces stay: unseen space cannot be predicted. So no renderability ever falls,
-seen from anywhere; and the order of hypothetical views does not matter.
+Colors and surfaces stay: unseen space cannot be predicted. So R never decreases, from any position,
+and the order of hypothetical views does not matter.
 
 Shape symbols: N rows of the map; n voxels; c cells; M voxels at a time.
 """
@@ -36,7 +36,7 @@ def simulate_view(
     T_world_camera: Float[Array, "4 4"],
     config: ScoringConfig,
 ) -> tuple[MapState, Bool[Array, " N"]]:
-    """Updates the map by a view that is only imagined.
+    """Updates the map by an imagined view.
 
     Args:
         state: the map before.
@@ -83,12 +83,12 @@ def simulate_view_near(
     T_world_camera: Float[Array, "4 4"],
     config: ScoringConfig,
 ) -> tuple[MapState, Cells]:
-    """Updates gathered voxels and cells by a view that is only imagined.
+    """Updates gathered voxels and cells by an imagined view.
 
     The unexplored cells that the view shows are no longer unexplored.
 
     Args:
-        voxels: those that hide or are seen; `scoring.gather.gather_in_range` gathers them.
+        voxels: those that occlude or are visible; `scoring.gather.gather_in_range` gathers them.
         cells: of the coarse grid.
         camera: of the view.
         T_world_camera: pose of the view.

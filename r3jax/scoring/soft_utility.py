@@ -1,20 +1,19 @@
 """A utility of a view that gradients can climb: smooth in position and direction.
 
-`view_utility` counts what is in the image and not hidden. Its derivative sees nothing enter or
-leave a view, nor kappa change between 1 and 2. Here, near the pose that it is made for,
+`view_utility` counts what is in the image and not hidden. Its derivative ignores that points enter
+and leave the view, and that kappa changes between 1 and 2. Here, near the pose that it is made for,
 
     U(c, R) = sum over points p of  n_p w_p(c) F_p(c, R) D_p(c)
 
-over the voxels and unexplored cells that nothing hides from that pose, c the camera's center and
-R its axes:
+over the voxels and unexplored cells visible from that pose, c the camera's center and R its axes:
 
 - w_p: 1 - R_p(c) of a voxel, lambda1 of an unexplored cell;
 - F_p: the product of a sigmoid of the angle to each side of the image;
-- D_p: a sigmoid of the distance that is left to the end of the range;
-- n_p: how many points p stands for, where there are more than room.
+- D_p: a sigmoid of the remaining distance to the end of the range;
+- n_p: the number of points that p represents if the points were sampled.
 
-Frozen at the pose are occlusion and kappa. So it is no bound on the utility: what it leads to is
-scored exactly before it is taken (`planning.refine`).
+Frozen at the pose are occlusion and kappa. It is not a bound on the utility, so that poses found
+with it are scored exactly before use (`planning.refine`).
 
 Shape symbols: m points, v of them voxels.
 """
@@ -38,16 +37,16 @@ from r3jax.scoring.terms import score_voxels
 from r3jax.visibility.views import pinhole_view
 
 MAX_VOXELS, MAX_CELLS = 1 << 12, 1 << 10
-"""Points of each kind that are summed over; an even sample where more are visible."""
+"""Maximum number of points of each kind; if more are visible, an even sample."""
 
 SOFTNESS = 0.04
 """Angle inside the image at which a point counts 73 % [rad]."""
 
 _MARGIN = math.radians(25.0)
-"""Points are collected so far beyond the image on each side [rad]."""
+"""Points are collected up to this angle beyond each side of the image [rad]."""
 
 _WIDEST = math.radians(75.0)
-"""Half the field of view in which they are collected, at most [rad]: a plane cannot show 90."""
+"""Maximum half angle of the field of view in which they are collected [rad]; below 90 degrees."""
 
 _RANGE_MARGIN = 1.2
 """Points are collected up to this multiple of the range."""
@@ -60,7 +59,7 @@ class SoftUtility(eqx.Module):
     """Centers of voxels, then of cells [m]."""
 
     count: Float[Array, " m"]
-    """Points that each stands for; 0: padding."""
+    """Number of points that each represents; 0: padding."""
 
     voxels: MapState
     """Rows of the voxels."""
@@ -80,10 +79,10 @@ class SoftUtility(eqx.Module):
     def __call__(self, T_world_camera: Float[Array, "4 4"]) -> Float[Array, ""]:
         """Computes the soft utility of a view."""
         R, position = T_world_camera[:3, :3], T_world_camera[:3, 3]
-        # Products and sums, not a matrix product: on some devices those round to ten bits.
+        # Products and sums, not a matrix product, which some devices compute with 10-bit mantissas.
         offset = self.points - position[:, None]
         x, y, z = (jnp.sum(R[:, j, None] * offset, axis=0) for j in range(3))
-        # Added under the root: at the camera itself the gradient stays finite.
+        # Added under the root: the gradient stays finite at the camera itself.
         distance = jnp.sqrt(x * x + y * y + z * z + 1e-6)
         left = (1.0 - distance / self.config.max_range) / self.softness
         visible = self.count * jax.nn.sigmoid(left)
@@ -118,9 +117,8 @@ def soft_utility(
         slope = jax.grad(lambda p, d: utility(r3jax.pose_along(p, d)), argnums=(0, 1))
         along_position, along_direction = slope(position, direction)
 
-    What hides what, and kappa, stay as they are at `T_world_camera`; what enters and leaves the
-    image and the sensor's range does so gradually, up to 25 degrees beyond the image. Beyond that
-    make another.
+    Occlusion and kappa are those at `T_world_camera`. Points enter and leave the image and the
+    sensor's range gradually, up to 25 degrees beyond the image; for larger turns make a new one.
 
     Args:
         state: the map.
@@ -128,8 +126,8 @@ def soft_utility(
         camera: of the views.
         T_world_camera: where occlusion is determined.
         config: settings of the utility.
-        softness: angle at the image's sides within which points enter [rad]; the smaller, the
-            closer to the exact utility, and the rougher.
+        softness: angle at the image's sides over which points enter [rad]; a smaller value is
+            closer to the exact utility, but less smooth.
     """
     config = ScoringConfig() if config is None else config
     made = soft_utility_near(state, cells_of(grid), camera, T_world_camera, config, softness)
@@ -145,7 +143,7 @@ def soft_utility_near(
     config: ScoringConfig,
     softness: Float[Array, ""] | float = SOFTNESS,
 ) -> SoftUtility:
-    """Prepares `soft_utility` of voxels and cells that were already gathered."""
+    """Prepares `soft_utility` from gathered voxels and cells."""
     farther = eqx.tree_at(lambda c: c.max_range, config, _RANGE_MARGIN * config.max_range)
     view = pinhole_view(_widened(camera), T_world_camera, farther)
     seen, unexplored = seen_in_view(voxels, cells, view, farther)
@@ -170,7 +168,7 @@ def _widened(camera: Camera) -> Camera:
     """Widens a camera by `_MARGIN` on every side, with the same number of pixels."""
 
     def lens(focal: Array, center: Array, size: int) -> tuple[Array, float]:
-        # Even about the axis: as much on each side as on the wider one.
+        # Symmetric about the axis: each side as wide as the wider one.
         half = jnp.arctan(jnp.maximum(center, size - center) / focal)
         return 0.5 * size / jnp.tan(jnp.minimum(half + _MARGIN, _WIDEST)), 0.5 * size
 
@@ -180,11 +178,10 @@ def _widened(camera: Camera) -> Camera:
 
 
 def _sample(chosen: Bool[Array, " n"], most: int) -> tuple[Int[Array, " m"], Float[Array, " m"]]:
-    """Samples evenly at most `most` of the chosen, with the number that each stands for.
+    """Samples at most `most` of the chosen evenly, and returns the number that each represents.
 
-    The number is 0 for padding.
-
-    Voxels lie in the order of a hash table: a sample by number is one by chance.
+    The number is 0 for padding. Rows of a hash table are in random order, so that an even sample of
+    rows is a random one.
     """
     num = chosen.shape[0]
     order = positions_of_set(chosen, num)

@@ -48,7 +48,7 @@ def consistency(
     `pairwise` is its text, one minus the mean squared difference over pairs, which equals
     1 - 2 tr(M) / (n - 1). Both are clipped to [0, 1], and are 1 for n <= 1.
     """
-    # The unbiased estimate; the floor only keeps a first observation from dividing by zero.
+    # The unbiased estimate; the floor avoids a division by zero at the first observation.
     variance = m2 / jnp.maximum(count - 1.0, 1.0)
     spread = 2.0 * variance if form == "pairwise" else jnp.sqrt(2.0 / 1.5 * variance)
     return jnp.where(count > 1.0, jnp.clip(1.0 - spread, 0.0, 1.0), 1.0)
@@ -64,11 +64,11 @@ def score_voxels(
     """Computes the terms of every voxel as seen from one camera position.
 
     Args:
-        voxels: what is known of them.
-        camera_position: center of the camera that asks [m].
+        voxels: their statistics.
+        camera_position: camera center [m].
         focal: its focal length [px], in the unit used when the map was made.
         forms: of kappa and delta.
-        kappa_is_one: kappa, where it was determined elsewhere; None: from here.
+        kappa_is_one: whether kappa is 1, if it was determined before; None: computed here.
     """
     delta = consistency(voxels.count, voxels.m2, forms.delta)
     # From the voxel to the camera, as the visited bins were recorded.
@@ -78,11 +78,11 @@ def score_voxels(
     cosine, inside = seen_directions(voxels.visited, direction, voxels.num_bins)
     is_one = (inside > 0.0) | (forms.kappa == "one") if kappa_is_one is None else kappa_is_one
     kappa_value = jnp.where(is_one, 1.0, 2.0)
-    # kappa is 1 or 2: a product will do, and no power whose gradient could fail at 0.
+    # kappa is 1 or 2: a product, not a power, whose gradient could be NaN at 0.
     bias = jnp.where(is_one, cosine, cosine * cosine)
     # delta may be exactly 0, where the gradient of a plain power is infinite or NaN.
     noise = safe_power(delta, kappa_value * (1.0 - bias))
-    # rho_max / rho with rho = f / d: to come closer than ever costs, to stay farther does not.
+    # rho_max / rho with rho = f / d: coming closer than before costs, staying farther does not.
     ratio = jnp.minimum(voxels.resolution * distance / focal, 1.0)
     resolution = safe_power(ratio, 1.0 - delta * bias)
     blank: Callable[[Array], Array] = lambda term: jnp.where(voxels.present, term, 0.0)

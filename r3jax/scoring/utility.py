@@ -1,4 +1,4 @@
-"""U_G, U_R and their sum: what one view would explore and how badly it would render now."""
+"""The utility of a view: U_G (what it would explore) and U_R (how badly it would render now)."""
 
 import equinox as eqx
 import jax
@@ -16,7 +16,7 @@ from r3jax.visibility.views import pinhole_view
 
 
 class ViewUtility(eqx.Module):
-    """What a view promises, before the path to it is paid for."""
+    """The utility of a view, without the cost of the path to it."""
 
     exploration: Float[Array, ""]
     """U_G: visible unexplored cells."""
@@ -55,7 +55,7 @@ def utility_of_view(
     T_world_camera: Float[Array, "4 4"],
     config: ScoringConfig,
 ) -> ViewUtility:
-    """Computes `view_utility` of voxels and cells that were already gathered."""
+    """Computes `view_utility` from gathered voxels and cells."""
     view = pinhole_view(camera, T_world_camera, config)
     position = T_world_camera[:3, 3]
     deficit, unexplored = sums_in_view(voxels, cells, view, position, camera.focal, config, 1)
@@ -71,7 +71,7 @@ def visible_unexplored(
     T_world_camera: Float[Array, "4 4"],
     config: ScoringConfig,
 ) -> Bool[Array, "X Y Z"]:
-    """Finds the cells that U_G of a view counts."""
+    """Finds the cells that U_G counts."""
     view = pinhole_view(camera, T_world_camera, config)
     _, unexplored = seen_in_view(state, cells_of(grid), view, config)
     return unexplored.reshape(grid.log_odds.shape)

@@ -132,7 +132,7 @@ def test_whole_numbers_may_be_written_as_people_do(text, number):
 
 @pytest.mark.parametrize("text", ["512x512", "1.5", "", "nan", "inf", "1e999999999", "0x10"])
 def test_what_is_no_whole_number_is_said_so(text):
-    with pytest.raises(ValueError, match="it takes one whole number"):
+    with pytest.raises(ValueError, match="expects one whole number"):
         whole_number(text)
 
 
@@ -142,7 +142,7 @@ def test_a_number_that_cannot_be_read_is_told_in_words(capsys):
             main(["train", "run", *words])
         assert stopped.value.code == 2
         said = capsys.readouterr().err
-        assert "it takes one whole number" in said
+        assert "expects one whole number" in said
         assert "int" not in said.replace("INT", "")
 
 

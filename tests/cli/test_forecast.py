@@ -40,7 +40,7 @@ def test_a_run_that_is_good_enough_says_so(runs):
 def test_going_on_takes_another_goal(runs, capsys):
     words = ["explore", "--resume", str(runs / "box"), "--until", "psnr:99", "--budget", "views:6"]
     assert main_without_report(words) == 0
-    assert "budget: 6 views" in capsys.readouterr().err
+    assert "stopped   6 views" in capsys.readouterr().err
     run = read_run(runs / "box")
     assert len(run.rows) == 6
     assert run.header.config["until"] == "psnr:99"

@@ -1,4 +1,4 @@
-"""Settings of an audit, which are options of `r3jax audit`, too. Its import is light."""
+"""Settings of an audit; they are also options of `r3jax audit`. Imports nothing heavy."""
 
 from dataclasses import dataclass
 
@@ -18,22 +18,23 @@ class AuditSettings(SurveySettings):
     """
 
     folds: int = 8
-    """Own frames are judged by a map without every N-th image, themselves among them."""
+    """Folds of the cross-validation: each frame is evaluated on a map without it and every N-th
+    frame."""
 
     views: int = 10
-    """Further views to suggest."""
+    """Number of further views to suggest."""
 
     num_places: int = 64
-    """Places at which views are looked for, at most."""
+    """Maximum number of positions searched for views."""
 
     num_standpoints: int = 24
-    """Places from which every surface is evaluated: the first of the others, at most."""
+    """Maximum number of these positions from which every surface is evaluated."""
 
     seed: int = 0
-    """Seed of the random views that the suggested ones are compared with."""
+    """Random seed of the views that the suggested ones are compared with."""
 
     def __post_init__(self) -> None:
-        """Refuses what makes no sense."""
+        """Refuses invalid settings."""
         super().__post_init__()
         at_least(self, {"folds": 2, "views": 0, "seed": 0})
         if self.views > _MOST_VIEWS:

@@ -1,6 +1,6 @@
-"""What all cells of a benchmark have in common, as the command line names it.
+"""Settings that all cells of a benchmark share, named like the command's options.
 
-Light on purpose: `r3jax benchmark --help` shows these fields, and must not wait for JAX.
+Imports nothing heavy: `r3jax benchmark --help` shows these fields and must not wait for JAX.
 """
 
 from dataclasses import dataclass
@@ -14,16 +14,17 @@ class ExplorationTerms:
     """Sensor, map and clock of every exploration."""
 
     clock: Literal["wall", "model"] = "wall"
-    """`wall`: measured planning and mapping, plus flight. `model`: fixed costs, repeatable."""
+    """Mission clock. `wall`: measured planning and mapping time plus travel time. `model`: fixed
+    costs plus travel time, repeatable."""
 
     resolution: int = 256
-    """Width and height of the explored images [px]."""
+    """Width and height of the images during exploration [px]."""
 
     fov: float = 60.0
     """Field of view [degrees]."""
 
     noise: float = 0.01
-    """Standard deviation of the explored depth as a share of the depth; test views have none."""
+    """Standard deviation of the depth noise during exploration, relative to the depth."""
 
     max_range: float = 5.0
     """Range of the depth sensor [m]."""
@@ -41,13 +42,13 @@ class TrainingTerms:
     """Size and length of every training, and how its model is evaluated."""
 
     train_resolution: int = 128
-    """Width and height of the images that are used for training and evaluation [px]."""
+    """Width and height of the images for training and evaluation [px]."""
 
     iterations: int = 2000
-    """Steps of every training."""
+    """Training steps."""
 
     gaussians: int = 20_000
-    """Gaussians at the start of every training."""
+    """Initial number of Gaussians."""
 
     capacity: int = 40_000
     """Maximum number of Gaussians."""
@@ -64,7 +65,7 @@ class TrainingTerms:
 
 
 def check_size(name: str, pixels: int | None, most: int | None = 4096) -> None:
-    """Refuses a width of images that leaves nothing to compare, or is too large.
+    """Refuses an image size that is too small to compare, or too large.
 
     Args:
         name: of the setting.

@@ -1,4 +1,4 @@
-"""`r3jax audit`: where a capture fails, how its frames would render, which views would help."""
+"""`r3jax audit`: finds where a capture fails, how its frames would render, which views to add."""
 
 import dataclasses
 import tempfile
@@ -28,7 +28,7 @@ _SHOWN = 5
 """Regions that the console lists."""
 
 _REPEATED = {"path", "out", "topics", *(field.name for field in dataclasses.fields(AuditSettings))}
-"""Options that hold for an audit of the same capture with further views."""
+"""Options to repeat in the suggested command, which audits the capture with further views."""
 
 
 def run_audit(options: AuditOptions) -> int:
@@ -50,7 +50,7 @@ def run_audit(options: AuditOptions) -> int:
 
 
 def _follow(options: AuditOptions, scratch: Path, progress: Console) -> None:
-    """Guides until Ctrl-C, then audits what came in; the page stays up until that is done.
+    """Guides the scan until Ctrl-C, then audits the received frames; the page stays up meanwhile.
 
     Raises:
         InputError: nothing came in.
@@ -65,9 +65,9 @@ def _follow(options: AuditOptions, scratch: Path, progress: Console) -> None:
         progress.say("Ctrl-C ends the scan, and audits it")
         topics = parse_topics(options.topics)
         source = follow(options.capture, page, scratch, up=options.terms.up, topics=topics)
-        settle_interrupt()  # it has ended the scan
+        settle_interrupt()  # It has ended the scan.
         if source is None:
-            raise InputError(f"{options.capture}: no frame came in")
+            raise InputError(f"{options.capture}: no frames were received")
         page.say("The scan has ended.", "its audit is being written")
         _audit(options, source, None, progress)
 

@@ -51,11 +51,11 @@ _LOOP = ("capture_every", "capture_rate", "gaze", "plan_while_moving")
 
 
 def run_benchmark(options: BenchmarkOptions) -> int:
-    """Runs what is left of a benchmark and prints its table; or only checks submissions.
+    """Runs the remaining cells of a benchmark and prints its table, or only checks submissions.
 
     Returns:
-        0 all cells are done, 1 some failed or a submission breaks a rule, 130 interrupted (start it
-        again to go on).
+        0 all cells are done, 1 some failed or a submission breaks a rule, 130 interrupted (run it
+        again to resume).
 
     Raises:
         ValueError, OSError, ImportError: an unknown scene or policy, a setting that cannot work, a
@@ -149,11 +149,11 @@ def _check_submissions(console: Console, options: BenchmarkOptions) -> int:
         for problem in problems[:_SHOWN]:
             console.say(f"{path}, {problem}", style="red")
         if len(problems) > _SHOWN:
-            console.say(f"{path}: {len(problems) - _SHOWN} problems more", style="red")
+            console.say(f"{path}: and {len(problems) - _SHOWN} more problems", style="red")
         if problems:
             code = 1
         else:
-            console.say(f"{path}: {len(submission.frames)} frames, all in order")
+            console.say(f"{path}: {len(submission.frames)} frames, no problems found")
     return code
 
 
@@ -181,8 +181,8 @@ def _plan(options: BenchmarkOptions, on_stage: Callable[[str], None]) -> tuple[C
     for name, path in zip(names, options.submissions.submission, strict=True):
         if names.count(name) > 1:
             raise InputError(
-                f"{path}: another submission is called {name[1]!r}, too, in {name[0]} with the "
-                f"seed {name[2]}: rename `policy.name` in one of them"
+                f"{path}: another submission has the same policy name {name[1]!r} in {name[0]} "
+                f"with the seed {name[2]}: rename `policy.name` in one of them"
             )
     return tuple(cells)
 
@@ -202,7 +202,7 @@ def _images_again(records: Sequence[dict[str, Any]]) -> list[str]:
         if (told := record.get("submission")) is not None and told["known_images"]:
             name = f"{record['policy']}, {record['scene']}, seed {record['seed']}"
             share = f"{told['same_images']} of {told['known_images']} images"
-            lines[f"{name}: {share} are those of the exploration, bit for bit"] = None
+            lines[f"{name}: {share} are bit-identical to those of the exploration"] = None
     return list(lines)
 
 
@@ -273,7 +273,7 @@ def _announce(
     if left and crowded and options.exploration.clock == "wall":
         console.say(
             f"warning: {machines.jobs} cells at a time slow each other down, and the wall clock "
-            "charges the policies for it; --jobs 1 or --clock model measure the same for all",
+            "charges the policies for it: use --jobs 1 or --clock model",
             style="yellow",
         )
 

@@ -17,10 +17,10 @@ DEFAULT_POLICIES = ("r3", "cover", "gavis", "random")
 
 
 def run_photos_of(console: Console, options: BenchmarkOptions) -> int:
-    """Runs what is left of all captures, seeds and policies, and prints their tables.
+    """Runs the remaining captures, seeds and policies, and prints their tables.
 
     Returns:
-        0 all is done, 130 interrupted (start it again to go on).
+        0 done, 130 interrupted (run it again to resume).
 
     Raises:
         ValueError, OSError, ImportError: a policy that cannot choose among photos, a capture

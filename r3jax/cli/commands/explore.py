@@ -50,10 +50,10 @@ from r3jax.scoring.config import ScoringConfig
 from r3jax.simulators.meshes import assumptions
 
 LEAST_CAPACITY = 1 << 14
-"""Rows that a map which may grow has at the start: all is compiled again whenever it doubles."""
+"""Minimum initial rows of a map that may grow: whenever it doubles, everything is recompiled."""
 
 EXIT_CODES = {StopReason.RECORDING_STOPPED: 1, StopReason.INTERRUPTED: 130}
-"""Exit codes of a run that can be gone on with; 0 for all others."""
+"""Exit codes of a run that can be resumed; 0 for all others."""
 
 
 def run_explore(options: ExploreOptions) -> int:
@@ -229,19 +229,19 @@ def scene_settings(options: ExploreOptions) -> SceneSettings:
 
 
 def warn_of_versions(console: Console, run: Run) -> None:
-    """Says which packages are not those that a run was begun with."""
+    """Warns if packages changed their version since the run began."""
     changed = changed_versions(run)
     if changed:
         console.say(
-            f"the run was begun with other versions ({', '.join(changed)}): what follows may "
-            "differ in the last digits from what would have followed then",
+            f"the run was recorded with other versions ({', '.join(changed)}): further views may "
+            "differ from those that these versions would have chosen",
         )
 
 
 def _conclude(console: Console, path: Path, result: Result) -> None:
     """Writes data set and report and prints a summary; a full disk must not hide the outcome."""
-    settle_interrupt()  # it has ended the run; what was recorded is written out
-    console.say(f"{result.reason.value}: {result.message}")
+    settle_interrupt()  # It has ended the run; what was recorded is written out.
+    console.say(f"stopped   {result.message}")
     if result.reason in EXIT_CODES:
         console.say(f"resume    {resume_command('explore', path)}")
     if result.state.views == 0:
@@ -324,9 +324,9 @@ def _crew(options: TeamOptions, console: Console, stack: contextlib.ExitStack) -
 
 def _conclude_team(console: Console, folder: Path, result: TeamResult) -> None:
     """Writes data sets and reports and prints a summary; a full disk must not hide the outcome."""
-    settle_interrupt()  # it has ended the runs; what was recorded is written out
+    settle_interrupt()  # It has ended the runs; what was recorded is written out.
     for number, member in enumerate(result.members):
-        console.say(f"{number}: {member.reason.value}: {member.message}")
+        console.say(f"camera {number} stopped: {member.message}")
     if any(member.reason in EXIT_CODES for member in result.members):
         console.say(f"resume    {resume_command('team', folder)}")
     if any(member.state.views == 0 for member in result.members):
@@ -364,7 +364,7 @@ def _against_time(views: tuple[TeamView, ...]) -> list[str]:
 
 
 _CAPTURE_EVERY = 0.3
-"""Distance between frames in the demo [m]: in half a minute of flight they gain four decibels."""
+"""Distance between frames captured while moving in the demo [m]; they gain 4 dB in 30 s."""
 
 
 def run_demo(options: DemoOptions) -> int:

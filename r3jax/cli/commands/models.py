@@ -107,7 +107,7 @@ def _conclude_training(
 
 
 def run_evaluate(options: EvaluateOptions) -> int:
-    """Judges a model and writes rows, summary and contact sheet.
+    """Evaluates a model and writes rows, summary and contact sheet.
 
     Raises:
         ValueError, OSError, ImportError: no model, no test views, views that cannot be evaluated, a

@@ -136,7 +136,7 @@ _DIFFERS = 1
 
 
 def run_replay(options: ReplayOptions) -> int:
-    """Rebuilds map and grid from the frames and compares them, array by array, bit by bit.
+    """Rebuilds map and grid from the frames and compares them bit by bit with the stored ones.
 
     Raises:
         ValueError, OSError: not a run, no stored map, a frame that is missing or not the recorded
@@ -156,7 +156,7 @@ def run_replay(options: ReplayOptions) -> int:
         what = f"{difference.num_different} elements, by at most {difference.largest:g}"
         text = "another shape" if difference.num_different < 0 else what
         console.say(f"  {difference.name}: {text}")
-    console.say("was it recorded with another version of r3jax, or on another kind of device?")
+    console.say("possible causes: another version of r3jax, or another kind of device")
     return _DIFFERS
 
 
@@ -185,7 +185,7 @@ def run_merge(options: MergeOptions) -> int:
 
 
 def run_forecast(options: ForecastOptions) -> int:
-    """Prints the forecast along the run, and what one more decibel would take.
+    """Prints the forecast along the run, and the estimated views for one more decibel.
 
     Raises:
         ValueError, OSError: not a run, a frame that is missing, or a file that is no calibration.
@@ -210,7 +210,7 @@ def run_forecast(options: ForecastOptions) -> int:
     out = Console()
     out.say(
         f"PSNR of free-space views [dB], calibrated on {calibration.source}; intervals hold "
-        f"{100 * LEVEL:.0f} % of its errors in scenes that it had not seen",
+        f"{100 * LEVEL:.0f} % of the errors in unseen scenes",
     )
     captures = outlook.frames != outlook.views
     out.print(f"views  {'frames  ' * captures} mean   p10   p50", style="bold")
@@ -266,7 +266,7 @@ def _write_submission(console: Console, run: Run, out: Path) -> int:
 
 
 def run_view(options: ViewOptions) -> int:
-    """Shows a run until Ctrl-C, or writes its images.
+    """Shows a run in the browser until Ctrl-C, or writes its images.
 
     Raises:
         InputError: no views yet.
@@ -276,7 +276,7 @@ def run_view(options: ViewOptions) -> int:
     console = Console(stderr=True)
     run = read_run(options.path)
     if not run.rows:
-        raise InputError(f"{run.path}: the run has no views yet: there is nothing to see")
+        raise InputError(f"{run.path}: the run has no views yet")
     config_of(run)  # says what is wrong with it
     if options.export is not None:
         return _export_images(run, options.export, options.video, console)

@@ -58,7 +58,7 @@ def run_select(options: SelectOptions) -> int:
 
 
 def _select_video(options: SelectOptions, progress: Console, console: Console) -> int:
-    """Selects frames of a video whose geometry is not known yet.
+    """Selects frames of a video, which has no poses yet.
 
     Raises:
         ValueError, OSError: as `select_video`; a folder that holds something else.
@@ -68,9 +68,9 @@ def _select_video(options: SelectOptions, progress: Console, console: Console) -
     with Stages(progress) as stages:
         found = select_video(options.capture, options.terms.frames or 1, folder, stages.on_progress)
     console.print(
-        f"{len(found.chosen)} of {len(found.motion)} frames: sharp ones, within equal motion. "
-        "Their geometry is not known yet: find poses first (COLMAP, ns-process-data images), "
-        "then select again from the result."
+        f"{len(found.chosen)} of {len(found.motion)} frames: the sharpest, evenly spaced by "
+        "motion. Compute their poses (COLMAP, ns-process-data images), then select again from "
+        "the result."
     )
     console.say(f"pictures  {folder / 'images'}")
     console.say(

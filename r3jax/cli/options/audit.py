@@ -15,7 +15,7 @@ from r3jax.formats.errors import check_capture
 from r3jax.formats.ros.bags import parse_topics
 
 _GROWING = (".json", ".mcap", ".db3", ".bag", ".active")
-"""Suffixes of files that may grow; of those that may not be followed their reader says why."""
+"""Suffixes of files that can grow; the reader explains why some of them cannot be followed."""
 
 _TERMS = FieldsOf(
     "views", "voxel_size", "max_range", "up", "max_frames", "folds", "seed", "depth_scale",
@@ -25,18 +25,18 @@ _TERMS = FieldsOf(
 
 @dataclass(frozen=True, kw_only=True)
 class GuideOptions:
-    """A page that says where to go next, while the capture is being taken."""
+    """A page with guidance while you scan."""
 
     live: bool = False
-    """Follow a folder or ROS bag that another program is writing: the page in the browser shows
-    what is done and where to go next. Ctrl-C ends it, with an audit of what came in."""
+    """Follow a folder or ROS bag that another program is writing: a page in the browser shows the
+    progress and where to go next. Ctrl-C ends it with an audit of the received frames."""
 
     port: int = 8080
     """Port of the page that --live shows; 0 takes any free one."""
 
     host: str = "127.0.0.1"
-    """Address that --live listens at. By default only this machine can see the page; 0.0.0.0
-    shows it to everybody who can reach the machine, such as a phone."""
+    """Address that --live listens on. By default the page is visible on this machine only; 0.0.0.0
+    makes it visible to everybody who can reach the machine, such as a phone."""
 
     def __post_init__(self) -> None:
         """Refuses a page that would not be shown, or could not be."""
@@ -48,7 +48,7 @@ class GuideOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class AuditOptions:
-    """Audit a capture: where splats of it would fail, how frames would render, which views to add.
+    """Audit a capture: where its splats would fail, how frames would render, which views to add.
 
     For example
         r3jax audit scans/kitchen
@@ -66,11 +66,11 @@ class AuditOptions:
     capture. By default the capture's own frames, each left out in turn."""
 
     out: Path | None = None
-    """Folder of the audit; by default runs/audit/NAME. An earlier audit in it is replaced."""
+    """Output folder; by default runs/audit/NAME. An earlier audit in it is replaced."""
 
     topics: Annotated[str | None, arg(metavar="NAMES")] = None
     """Topics and frames of a ROS bag, such as color=/cam/image_raw,pose=/odom; also depth, info,
-    depth_info, frame, world. By default they are found."""
+    depth_info, frame, world. By default they are detected."""
 
     terms: Annotated[AuditSettings, _TERMS] = field(default_factory=AuditSettings)
     guide: Annotated[GuideOptions, arg(name="guidance while scanning")] = field(
@@ -78,7 +78,7 @@ class AuditOptions:
     )
 
     def __post_init__(self) -> None:
-        """Refuses what can be seen to be wrong before the capture is read."""
+        """Checks the values before the capture is read."""
         parse_topics(self.topics)
         if self.guide.live:
             _check_live(self.capture)
@@ -101,7 +101,7 @@ class AuditOptions:
 
 
 def _check_live(path: Path) -> None:
-    """Refuses what does not grow, and what can never come to be, such as the name of a topic.
+    """Refuses a finished file, and a path that can never be recorded, such as a topic's name.
 
     Raises:
         ValueError: says what can be followed.

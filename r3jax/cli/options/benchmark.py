@@ -63,17 +63,17 @@ class TrainingOptions(TrainingTerms):
 
 @dataclass(frozen=True, kw_only=True)
 class MachineOptions:
-    """Where the cells run."""
+    """Where the cells (a scene, a policy, a seed) run."""
 
     engine: Literal["local", "slurm"] = "local"
-    """`local`: processes on this machine, one GPU each where there are several. `slurm`: an array
-    job, pre-emption safe."""
+    """`local`: processes on this machine, one per GPU. `slurm`: an array job that survives
+    pre-emption."""
 
     jobs: int = 1
-    """Cells at a time; 0: one by one in this very process, for debugging."""
+    """Cells to run in parallel; 0: one after the other in this process, for debugging."""
 
     slurm: Annotated[tuple[str, ...], arg(metavar="NAME=VALUE")] = ()
-    """Parameters of the array job, as submitit calls them: `timeout_min=240`,
+    """Parameters of the array job under submitit's names: `timeout_min=240`,
     `slurm_partition=gpu`, `gpus_per_node=1`, ..."""
 
     def __post_init__(self) -> None:
@@ -93,12 +93,12 @@ class SubmissionOptions:
     """Views chosen elsewhere."""
 
     submission: Annotated[tuple[Path, ...], arg(metavar="FILE")] = ()
-    """Evaluate these submissions (`r3jax export --format submission` writes one): check them,
-    render their frames again, train and evaluate. Scene, seed, budget and sensor come from the
-    submission; use --scenes to locate mesh files."""
+    """Evaluate submissions (written by `r3jax export --format submission`): check them, render
+    their frames again, train and evaluate. Scene, seed, budget and sensor come from the submission;
+    use --scenes to locate mesh files."""
 
     check: bool = False
-    """With --submission: only check the rules. The exit code is 1 if one is broken."""
+    """With --submission: only check the rules; the exit code is 1 if one is broken."""
 
     def __post_init__(self) -> None:
         """Refuses a path that is not a file."""
@@ -120,8 +120,8 @@ class SiteOptions:
     """A page of the results."""
 
     site: Annotated[Path | None, arg(metavar="FOLDER")] = None
-    """Only write a static page of all records in --out into this folder: tables with intervals, and
-    images of the worst views."""
+    """Only write a static results page of the records in --out into this folder: tables with
+    intervals, and images of the worst views."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,21 +129,21 @@ class PhotoOptions:
     """Choice among the photos of a capture (COVER's protocol)."""
 
     photos: Annotated[tuple[Path, ...], arg(metavar="PATH")] = ()
-    """Choose among the photos of these captures with depth, while a model trains on those chosen;
-    every eighth photo is a test view. Recordings are y-up without --up. Policies by default:
-    r3,cover,gavis,random; --iterations count after the last photo."""
+    """Choose among the photos of captures with depth, while a model trains on the chosen ones;
+    every eighth photo is a test view. Recordings are y-up unless --up is given. Default policies:
+    r3,cover,gavis,random. --iterations counts from the last photo."""
 
     choose: int = 20
-    """Photos that are chosen."""
+    """Photos to choose."""
 
     first: int = 10
-    """Photos that every choice begins with, drawn by the seed."""
+    """Initial photos, drawn at random by the seed and the same for all policies."""
 
     nearest: int = 5
-    """Candidates of a choice: the photos nearest to the last one."""
+    """Candidates of each choice: this number of photos nearest to the last one."""
 
     every: int = 200
-    """Steps of training between two choices."""
+    """Training steps between two choices."""
 
     def __post_init__(self) -> None:
         """Refuses a path that is not a capture."""
@@ -176,8 +176,8 @@ class BenchmarkOptions:
     """When every exploration stops: `views:N`, `seconds:S` of the mission clock, or `meters:M`."""
 
     snapshots: Annotated[str | None, arg(metavar="A,B")] = None
-    """Where a model is trained and evaluated, for example `views:30,views:60`; by default at the
-    budget."""
+    """Points of the run at which a model is trained and evaluated, such as `views:30,views:60`; by
+    default the budget."""
 
     out: Path = Path("runs/benchmark")
     """Folder of the results. Finished cells are skipped: run the same command again to resume."""
@@ -235,7 +235,7 @@ def words(text: str) -> tuple[str, ...]:
 
 
 def parse_settings(option: str, given: Iterable[str]) -> dict[str, Any]:
-    """Reads `NAME=VALUE` words; a value that is no number, true or false is a text.
+    """Parses `NAME=VALUE` arguments; values that are not JSON are strings.
 
     Raises:
         ValueError: a word without a name or without a value; names the option.

@@ -35,7 +35,7 @@ _WITH_FORK = (
 """Options that make sense beside these; all others are fixed by what was recorded."""
 
 MapAndClock = FieldsOf("voxel_size", "cell_size", "max_range", "capacity", "clock")
-"""Settings of the loop for a team."""
+"""Settings of the loop that a team has."""
 
 Loop = FieldsOf(
     *MapAndClock.names, "until", "capture_every", "capture_rate", "gaze", "exposure", "blur",
@@ -54,22 +54,22 @@ class DemoOptions:
     """
 
     out: Path = Path("runs")
-    """Folder that holds the runs; the demo overwrites `demo` in it and nothing else."""
+    """Folder for runs; the demo overwrites only its subfolder `demo`."""
 
     views: int = 16
-    """Views to choose; frames captured while moving come on top."""
+    """Number of views to choose; frames captured while moving are extra."""
 
     resolution: int = 256
     """Width and height of the images [px]."""
 
     train_resolution: int = 128
-    """Width and height of the images that are trained on [px]."""
+    """Width and height of the training images [px]."""
 
     iterations: int = 1000
-    """Steps of the training."""
+    """Training steps."""
 
     def __post_init__(self) -> None:
-        """Refuses what no run or training can be made of."""
+        """Refuses values that no run or training takes."""
         parse_budget(f"views:{self.views}")
         check_size("resolution", self.resolution)
         check_size("train_resolution", self.train_resolution)
@@ -78,7 +78,7 @@ class DemoOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ContinueOptions:
-    """A run that is resumed, or left for another."""
+    """Start from an existing run."""
 
     resume: Annotated[Path | None, arg(metavar="RUN")] = None
     """Resume an interrupted run with its own settings; a larger --budget extends it."""
@@ -88,8 +88,8 @@ class ContinueOptions:
     sensor are the run's."""
 
     at: Annotated[int | None, arg(metavar="FRAME")] = None
-    """First frame to replace; earlier frames are reused. Without frames captured while moving every
-    frame is a view."""
+    """First frame to replace; earlier frames are reused. Frames are numbered as in trace.jsonl,
+    those captured while moving included."""
 
     def __post_init__(self) -> None:
         """Refuses both at once, and a fork from nowhere."""
@@ -106,39 +106,39 @@ class ContinueOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class MotionOptions:
-    """How the camera moves: a preset, and what differs from it."""
+    """How the camera moves: a preset, and changes to it."""
 
     motion: Literal["free", "ground", "gimbal", "handheld"] = "free"
-    """Camera platform: `free`: a camera that flies; `ground`: a robot whose camera is level and at
-    the height where it starts; `gimbal`: a drone that cannot look up far; `handheld`: a person. The
-    options below change it."""
+    """Camera platform. `free`: flies in any direction; `ground`: a robot with a level camera at a
+    fixed height; `gimbal`: a drone that cannot look far up; `handheld`: a person. The options below
+    change the preset."""
 
     heights: Annotated[tuple[float, float] | None, arg(metavar="LOW HIGH")] = None
-    """Lowest and highest place of the camera, above the start [m]."""
+    """Lowest and highest camera position, relative to the start [m]."""
 
     heights_above: Literal["start", "world"] | None = None
-    """What --heights count from: `start`, or `world` for z = 0."""
+    """Origin of --heights: `start`, or `world` for z = 0."""
 
     elevations: Annotated[tuple[float, float] | None, arg(metavar="LOW HIGH")] = None
-    """Lowest and highest angle of the line of sight above the horizon [degrees]."""
+    """Lowest and highest elevation of the viewing direction [degrees]."""
 
     footprint: Annotated[float | None, arg(metavar="RADIUS")] = None
-    """Radius of the robot or person on the floor [m]; it reaches up to the camera."""
+    """Radius of the robot or person [m], from the floor up to the camera."""
 
     body: Annotated[float | None, arg(metavar="LENGTH")] = None
-    """Instead of a footprint: clearance that is needed below the camera [m]."""
+    """Clearance needed below the camera [m]; an alternative to --footprint."""
 
     speed: Annotated[float | None, arg(metavar="SPEED")] = None
     """Speed along the path [m/s]."""
 
     turn_rate: Annotated[float | None, arg(metavar="RATE")] = None
-    """How fast the line of sight turns [degrees/s]."""
+    """Speed of turning [degrees/s]."""
 
     turn_per_meter: Annotated[float | None, arg(metavar="ANGLE")] = None
-    """Largest turn for each meter between a view and the next [degrees/m]."""
+    """Maximum turn per meter between two views [degrees/m]."""
 
     def __post_init__(self) -> None:
-        """Refuses what cannot move."""
+        """Refuses limits with which no camera can move."""
         _ = self.of_robot
 
     @property
@@ -147,7 +147,7 @@ class MotionOptions:
         given = settings_for(Motion, self)
         if self.footprint is not None:
             if self.body is not None:
-                raise InputError("--footprint and --body both say what must fit: give one")
+                raise InputError("--footprint and --body both set the clearance: give only one")
             given["body"] = Body(self.footprint)
         return make_motion(self.motion, **{k: v for k, v in given.items() if v is not None})
 
@@ -160,10 +160,10 @@ class PlanningOptions:
     """Candidates per decision (policy's default: 100)."""
 
     lambda1: Annotated[float | None, arg(metavar="WEIGHT")] = None
-    """Weight of a visible unexplored cell against a voxel that renders badly."""
+    """Weight of a visible unexplored cell relative to a voxel with R = 0 (policy's default: 16)."""
 
     lambda2: Annotated[float | None, arg(metavar="WEIGHT")] = None
-    """Weight of the path length against the utility (policy's default: 0.5)."""
+    """Weight of the path length relative to the utility (policy's default: 0.5)."""
 
     refine: Annotated[int | None, arg(metavar="N")] = None
     """Refine the best N candidates of `r3` or `r3-pano` by gradient ascent (0: none)."""
@@ -182,7 +182,7 @@ class PageOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ExploreOptions:
-    """Explore a scene: choose every view, record images, depth, poses, and write a report.
+    """Explore a scene: choose every view, record images, depth and poses, and write a report.
 
     For example
         r3jax explore --scene flat --budget views:50
@@ -195,19 +195,19 @@ class ExploreOptions:
     `replica:<name>`, or `habitat:<file>` (GLB, PLY, stage config)."""
 
     policy: Annotated[str | None, arg(metavar="POLICY")] = None
-    """Policy that chooses the views: `r3-pano` by default; `r3jax policies` lists them. A class
-    of yours is `module:Class`, a program in any language `exec:COMMAND`."""
+    """Policy that chooses the views: `r3-pano` by default; `r3jax policies` lists them. Your own is
+    `module:Class`, or `exec:COMMAND` for a program in any language."""
 
     budget: Annotated[str | None, arg(metavar="BUDGET")] = None
-    """When to stop: `views:N` (100 by default), `seconds:S` of the mission clock, `meters:M`, or
-    `frames:N`, those captured while moving included."""
+    """When to stop: `views:N` (100 by default), `seconds:S` of the mission clock, `meters:M` of
+    path, or `frames:N` including those captured while moving."""
 
     seed: int = 0
     """Random seed."""
 
     fixed_capacity: bool = False
-    """Never grow the map, which has 16384 rows at least where it may grow: what finds no row is
-    counted as dropped and reported."""
+    """Never enlarge the map's table (--capacity rows): voxels beyond it are dropped, counted and
+    reported."""
 
     earlier: Annotated[ContinueOptions, arg(name="resume and fork")] = field(
         default_factory=ContinueOptions
@@ -224,7 +224,7 @@ class ExploreOptions:
 
     @property
     def changes_policy(self) -> bool:
-        """True if a fork decides otherwise than the run that it leaves."""
+        """True if a fork uses another policy or other settings than the original run."""
         return self.policy is not None or self.planning != PlanningOptions()
 
     def path(self, policy: str) -> Path:
@@ -238,7 +238,7 @@ class ExploreOptions:
         return self.folder.out / (self.folder.name or name)
 
     def __post_init__(self) -> None:
-        """Refuses what can be seen to be wrong before JAX is imported and the scene is opened."""
+        """Checks the values before JAX is imported and the scene is opened."""
         if self.earlier.resume is not None:
             refuse_others(self, "--resume", "recorded run", _WITH_RESUME)
         elif self.earlier.fork is not None:
@@ -262,7 +262,7 @@ class ExploreOptions:
         self._check_captures()
 
     def _check_captures(self) -> None:
-        """Refuses settings of captures that would be ignored, or not be kept."""
+        """Refuses settings of captures that would be ignored or could not be met."""
         loop, default = self.loop, ExplorationConfig()
         for name in ("gaze", "exposure", "blur"):
             if getattr(loop, name) != getattr(default, name) and not loop.captures:
@@ -272,7 +272,7 @@ class ExploreOptions:
                 )
         if loop.blur != default.blur and loop.exposure == 0.0:
             raise InputError(
-                "--blur does nothing while nothing blurs: add --exposure, or leave it out"
+                "--blur has no effect without --exposure: add --exposure, or leave --blur out"
             )
         largest = (self.robot.of_robot.speed or loop.speed) / LEAST_PIECE
         if loop.capture_rate is not None and loop.capture_rate > largest * (1.0 + 1e-9):
@@ -284,7 +284,7 @@ class ExploreOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class TeamOptions:
-    """Explore a scene with several cameras at once that share what they see.
+    """Explore a scene with several cameras at once that share their maps.
 
     For example
         r3jax team --scene office --cameras 3 --budget seconds:120
@@ -296,7 +296,7 @@ class TeamOptions:
     `replica:<name>`, or `habitat:<file>` (GLB, PLY, stage config)."""
 
     cameras: int = 2
-    """Number of cameras that fly at the same time."""
+    """Number of cameras."""
 
     policy: tuple[str, ...] = (DEFAULT_POLICY,)
     """Policy of each camera; one for all, or one for each."""
@@ -315,7 +315,7 @@ class TeamOptions:
     `meters:M`."""
 
     meet_every: float = 0.0
-    """Seconds of the mission clock between two meetings; 0: they are always in touch."""
+    """Seconds of the mission clock between exchanges of frames; 0: always connected."""
 
     resume: Annotated[Path | None, arg(metavar="TEAM")] = None
     """Resume an interrupted team with its own settings; a larger --budget extends it."""
@@ -377,7 +377,7 @@ class TeamOptions:
         ]
 
     def __post_init__(self) -> None:
-        """Refuses what can be seen to be wrong before JAX is imported and the scene is opened."""
+        """Checks the values before JAX is imported and the scene is opened."""
         if self.resume is not None:
             if self.budget is not None:
                 parse_budget(self.budget)

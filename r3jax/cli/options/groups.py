@@ -1,6 +1,6 @@
 """Groups of options that several commands share, and what several of them refuse.
 
-Nothing here imports JAX: `--help` and a slip of the keyboard must not wait for it.
+Nothing here imports JAX: `--help` and mistyped options must not wait for it.
 """
 
 import sys
@@ -20,13 +20,13 @@ from r3jax.planning.policies import check_policy
 
 @dataclass(frozen=True, kw_only=True)
 class FolderOptions:
-    """Where a run is kept."""
+    """Where the run is stored."""
 
     name: Annotated[str | None, arg(metavar="NAME")] = None
-    """Name of the folder; by default made of the scene, the policy and the seed."""
+    """Name of the run's folder; by default made from the scene, the policy and the seed."""
 
     out: Path = Path("runs")
-    """Folder that holds it."""
+    """Folder that contains the run's folder."""
 
     overwrite: bool = False
     """Overwrite an existing run of that name."""
@@ -42,13 +42,13 @@ class MeshOptions:
     """How mesh files are opened."""
 
     up: Literal["y", "z"] | None = None
-    """Vertical axis of a mesh file; by default y for GLB and glTF, z for the others."""
+    """Vertical axis of a mesh file; by default y for GLB and glTF, z for other formats."""
 
     scale: float = 1.0
-    """Meters in a unit of a mesh file: 0.001 for one in millimeters."""
+    """Unit of a mesh file [m]: 0.001 for millimeters."""
 
     cull_backfaces: bool = False
-    """Look through faces seen from behind, as Habitat-Sim always does."""
+    """Do not render back faces, like Habitat-Sim."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,12 +56,12 @@ class WorldOptions(MeshOptions):
     """How a scene is opened."""
 
     start: Annotated[tuple[float, float, float] | None, arg(metavar="X Y Z")] = None
-    """Start position in the z-up world [m]; by default the scene's own, or a search."""
+    """Start position in the z-up world [m]; by default the scene's own, or found by a search."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraOptions:
-    """What the camera sees."""
+    """The simulated camera."""
 
     resolution: int = 512
     """Width and height of the images [px]."""
@@ -70,10 +70,10 @@ class CameraOptions:
     """Field of view [degrees]."""
 
     noise: float = 0.01
-    """Standard deviation of the depth noise as a share of the depth."""
+    """Standard deviation of the depth noise, relative to the depth."""
 
     def __post_init__(self) -> None:
-        """Refuses images that no run is made of."""
+        """Refuses image sizes that no run takes."""
         check_size("resolution", self.resolution)
 
 
@@ -85,22 +85,22 @@ class ReadingOptions:
     """Rasterizer: numba on CPUs, splax on NVIDIA GPUs if installed, xla elsewhere."""
 
     up: Literal["y", "z"] = "y"
-    """Axis of a recording's world that points up."""
+    """Vertical axis of a recording's world."""
 
     seed: int = 0
     """Random seed."""
 
     topics: Annotated[str | None, arg(metavar="NAMES")] = None
     """Topics and frames of a ROS bag, such as color=/cam/image_raw,pose=/odom; also depth, info,
-    depth_info, frame, world. By default they are found."""
+    depth_info, frame, world. By default they are detected."""
 
     def __post_init__(self) -> None:
-        """Refuses topics that are not understood."""
+        """Refuses topics that cannot be parsed."""
         parse_topics(self.topics)
 
 
 def refuse_others(options: Any, flag: str, source: str, allowed: tuple[str, ...]) -> None:
-    """Refuses options that would be ignored beside another one.
+    """Refuses options that another option makes irrelevant.
 
     Args:
         options: of a command.
@@ -118,7 +118,7 @@ def refuse_others(options: Any, flag: str, source: str, allowed: tuple[str, ...]
 
 
 def check_policy_here(name: str) -> None:
-    """Refuses a policy that is not there; a class may be in the current folder.
+    """Refuses an unknown policy; classes are also looked up in the current folder.
 
     Raises:
         ValueError: as `check_policy`.
@@ -130,7 +130,7 @@ def check_policy_here(name: str) -> None:
 
 
 def check_scene(name: str, scale: float) -> None:
-    """Refuses a scene that is not there.
+    """Refuses an unknown scene.
 
     Raises:
         ValueError: names the known ones, or the file.
@@ -141,7 +141,7 @@ def check_scene(name: str, scale: float) -> None:
 
 
 def check_folder_name(name: str) -> None:
-    """Refuses a --name that would lead out of the folder it is meant for.
+    """Refuses a --name that is a path out of its folder.
 
     Raises:
         ValueError: the name is a path.
@@ -151,7 +151,7 @@ def check_folder_name(name: str) -> None:
 
 
 def check_run(path: Path) -> None:
-    """Refuses what is no folder of a run.
+    """Refuses a path that is not a run's folder.
 
     Raises:
         ValueError: names the folder.
@@ -164,7 +164,7 @@ def check_run(path: Path) -> None:
 
 
 def check_free(folder: Path, overwrite: bool) -> None:
-    """Refuses to begin a run where one is, unless it is to be replaced.
+    """Refuses a folder that contains a run, unless it may be overwritten.
 
     Raises:
         ValueError: names the folder.
@@ -176,7 +176,7 @@ def check_free(folder: Path, overwrite: bool) -> None:
 
 
 def check_folder(path: Path) -> None:
-    """Refuses a file where a folder is to be written, and what no folder can be called.
+    """Refuses a file in place of a folder, and a name that no folder can have.
 
     Raises:
         ValueError: names the path.
@@ -188,7 +188,7 @@ def check_folder(path: Path) -> None:
 
 
 def check_model(path: Path, name: str, resolution: int | None) -> None:
-    """Refuses a path, a name or a size that no training and no evaluation takes.
+    """Refuses a path, a name or an image size that neither training nor evaluation takes.
 
     Raises:
         ValueError: names the option or the path.

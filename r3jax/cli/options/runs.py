@@ -1,4 +1,4 @@
-"""The options of the commands that take a run as it is."""
+"""The options of the commands that read a run."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,23 +24,23 @@ class InfoOptions:
     """A run folder, or a recording (images/, depth/, poses.txt, K.txt)."""
 
     plot: Annotated[Path | None, arg(metavar="PNG")] = None
-    """PNG for a recording's renderability, frame by frame."""
+    """Plot a recording's renderability, frame by frame, into this PNG."""
 
     up: Literal["y", "z"] = "y"
-    """Axis of a recording's world that points up."""
+    """Vertical axis of a recording's world."""
 
     voxel_size: float = 0.05
-    """Edge of a voxel when a recording is mapped [m]."""
+    """Voxel size for mapping a recording [m]."""
 
     def __post_init__(self) -> None:
-        """Refuses a path where nothing is."""
+        """Refuses a path that does not exist."""
         if self.path is not None:
             check_capture(self.path)
 
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    """Rebuild the map of a run from its recorded frames, and compare it with the stored one.
+    """Check a run: rebuild the map from the recorded frames and compare it with the stored one.
 
     For example
         r3jax replay runs/demo
@@ -56,7 +56,7 @@ class ReplayOptions:
 
 @dataclass(frozen=True)
 class MergeOptions:
-    """Merge two runs of one scene: their frames in one data set, and the map that saw both.
+    """Merge two runs of one scene into one data set and one map.
 
     For example
         r3jax merge runs/first runs/second --out runs/both
@@ -66,22 +66,20 @@ class MergeOptions:
     """A run folder."""
 
     second: Annotated[Path, Positional, arg(metavar="RUN")]
-    """Another one: the same scene, sensor, voxels and cells."""
+    """Another run with the same scene, sensor, voxel size and cell size."""
 
     out: Path | None = None
     """Folder of the merged run; by default both names joined by `+`, beside the first."""
 
     overwrite: bool = False
-    """Replace the run that is there."""
+    """Overwrite an existing run at --out."""
 
     def __post_init__(self) -> None:
-        """Refuses what are no two runs."""
+        """Refuses paths that are not two different runs."""
         for path in (self.first, self.second):
             check_run(path)
         if self.first.samefile(self.second):
-            raise InputError(
-                f"{self.first}: a run is not merged with itself: give two different runs"
-            )
+            raise InputError(f"{self.first}: both runs are the same: give two different ones")
 
 
 @dataclass(frozen=True)
@@ -96,10 +94,11 @@ class ForecastOptions:
     """A run folder."""
 
     calibration: Annotated[Path | None, arg(metavar="JSON")] = None
-    """A calibration of your own (`python -m experiments.forecast`); by default the package's."""
+    """Your own calibration (made by `python -m experiments.forecast`); by default the built-in
+    one."""
 
     plot: Annotated[Path | None, arg(metavar="PNG")] = None
-    """PNG for the forecast along the run."""
+    """Plot the forecast along the run into this PNG."""
 
     def __post_init__(self) -> None:
         """Refuses what is no run."""
@@ -120,8 +119,7 @@ class ExportOptions:
     """A run folder."""
 
     out: Annotated[Path, arg(metavar="FOLDER")]
-    """Where to: a folder that does not exist yet; of a submission, a file. It needs the run no
-    longer."""
+    """New folder for the export (for a submission: a new file). It does not depend on the run."""
 
     format: Literal["nerfstudio", "colmap", "colmap-text", "submission"] = "nerfstudio"
     """`nerfstudio`: images, depth, points.ply, transforms.json. `colmap`: the same with
@@ -129,7 +127,7 @@ class ExportOptions:
     poses, some kB, for `r3jax benchmark --submission`."""
 
     def __post_init__(self) -> None:
-        """Refuses what is no run, and to write over anything."""
+        """Refuses a path that is not a run, and an output that exists."""
         check_run(self.path)
         if self.format == "submission":
             if self.out.exists():
@@ -142,9 +140,9 @@ class ExportOptions:
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """Look at a run in the browser: the map over time, and what a camera that you drag would see.
+    """View a run in the browser: the map over time, and the view of a camera that you drag.
 
-    Or, with --export, write the images without a browser.
+    With --export, write the images without a browser.
 
     For example
         r3jax view runs/demo
@@ -158,27 +156,26 @@ class ViewOptions:
     """Port of the page; 0 takes any free one."""
 
     host: str = "127.0.0.1"
-    """Address to listen at. By default only this machine can see the page; 0.0.0.0 shows it
-    to everybody who can reach the machine."""
+    """Address to listen on. By default the page is visible on this machine only; 0.0.0.0 makes it
+    visible to everybody who can reach the machine."""
 
     allow: Annotated[tuple[str, ...], arg(metavar="NAME")] = ()
-    """Host names under which the page may be requested, and whose web pages may use it, beside this
-    machine's own: of a proxy, or of a name server's."""
+    """Further host names under which the page may be requested, such as that of a proxy."""
 
     name: Annotated[str | None, arg(metavar="MODEL")] = None
     """Name of the trained model, as given to `r3jax train`; by default `last` or the newest."""
 
     no_scene: bool = False
-    """Do not open the scene that the run was recorded in: no true image, no mesh."""
+    """Do not open the recorded scene: no ground-truth image, no mesh."""
 
     export: Annotated[Path | None, arg(metavar="FOLDER")] = None
-    """Write images of the map and one for every view into a folder that does not exist yet."""
+    """Write images of the map, and one for every view, into a new folder."""
 
     video: bool = False
-    """With --export: a film of the run too (MP4)."""
+    """With --export: also write a video of the run (MP4)."""
 
     def __post_init__(self) -> None:
-        """Refuses what is no run, and a film that would not be written."""
+        """Refuses a path that is not a run, and --video without --export."""
         check_run(self.path)
         if self.name is not None:
             check_folder_name(self.name)
@@ -188,7 +185,7 @@ class ViewOptions:
 
 @dataclass(frozen=True)
 class PoliciesOptions:
-    """List the available policies with a sentence and their source.
+    """List the available policies with a one-line description and their source.
 
     For example
         r3jax policies

@@ -35,15 +35,15 @@ class SelectOptions:
     capture: Annotated[Path, Positional, arg(metavar="CAPTURE")]
     """Everything that `r3jax audit` reads: nerfstudio's transforms.json or its folder, a COLMAP
     model, a phone's scan, a ROS bag, a scene of ScanNet, Replica-SLAM, TUM or 7-Scenes, a
-    recording, or a run. Or a video without poses, of which --frames N sharp ones are taken within
-    equal motion."""
+    recording, or a run. Or a video without poses: --frames N sharp frames, evenly spaced by
+    motion."""
 
     out: Path | None = None
     """Folder of the data set; by default runs/select/NAME. An earlier selection in it is
     replaced."""
 
     copy: bool = False
-    """Copy the pictures; by default they are links to the capture's."""
+    """Copy the pictures; by default they are linked."""
 
     topics: Annotated[str | None, arg(metavar="NAMES")] = None
     """Topics and frames of a ROS bag, as for `r3jax audit`."""
@@ -51,14 +51,13 @@ class SelectOptions:
     terms: Annotated[SelectSettings, _TERMS] = field(default_factory=SelectSettings)
 
     def __post_init__(self) -> None:
-        """Refuses what can be seen to be wrong before the capture is read."""
+        """Checks the values before the capture is read."""
         parse_topics(self.topics)
         if not is_video(self.capture):
             check_capture(self.capture)
         elif self.terms != SelectSettings(frames=self.terms.frames or 1):
             raise InputError(
-                f"{self.capture}: of a video nothing is known but its pictures: give --frames N, "
-                "and no other choice"
+                f"{self.capture}: a video has no poses: give --frames N and no other setting"
             )
         if self.out is not None:
             check_folder(self.out)
@@ -66,5 +65,5 @@ class SelectOptions:
         targets = self.terms.targets
         if targets not in (FRAMES, STAND) and not Path(targets).exists():
             raise InputError(
-                f"--targets {targets}: it is neither {FRAMES} nor {STAND}, and no such file exists"
+                f"--targets must be {FRAMES}, {STAND} or an existing file, got {targets}"
             )
