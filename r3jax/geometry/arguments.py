@@ -1,7 +1,7 @@
 """Validates arguments of the public API: mistakes that would give plausible but wrong results.
 
-Kinds and shapes are known while tracing, so they are refused under jit too. Values are looked at
-where they are known; under jit an invalid pose makes the result NaN (`cameras.nan_unless_valid`).
+Types and shapes are known while tracing, so they are checked under jit, too. Values are checked
+outside jit; under jit an invalid pose makes the result NaN (`cameras.nan_unless_valid`).
 """
 
 import functools
@@ -18,14 +18,14 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 Check = Callable[[str, Any], None]
-"""Told the name and the value of an argument; raises what is wrong with it."""
+"""A check: takes the name and the value of an argument, and raises an error if it is invalid."""
 
 
 def checked(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Decorates a call with checks of arguments, by their names. Defaults are not checked."""
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
-        # Worked out once, while decorating: a call then pays for no reflection.
+        # Computed once, while decorating: calls need no reflection.
         order = list(inspect.signature(function).parameters)
         usage = f"{getattr(function, '__name__', '')}({', '.join(order)})"
         places = [(order.index(name), name, check) for name, check in checks.items()]
@@ -43,7 +43,7 @@ def checked(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
                 try:
                     check(name, value)
                 except TypeError as error:
-                    # A wrong kind often means a wrong order, where the usage helps.
+                    # A wrong type often means a wrong order, for which the usage helps.
                     raise TypeError(f"{error}; the call is {usage}") from None
             return function(*args, **kwargs)
 
@@ -53,12 +53,12 @@ def checked(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
 
 def one(kind: type, hint: str, leaf: str = "", ndim: int = 0) -> Check:
-    """Checks that an argument is one object of a kind, not an array nor several stacked.
+    """Checks that an argument is a single object of a class, neither an array nor a stack of them.
 
     Args:
         kind: its class.
-        hint: where such an object comes from.
-        leaf: an array in it; empty: it has none.
+        hint: how to make such an object.
+        leaf: name of an array in it; empty: none.
         ndim: the axes that this array has in one object.
 
     Returns:
@@ -70,7 +70,8 @@ def one(kind: type, hint: str, leaf: str = "", ndim: int = 0) -> Check:
             raise TypeError(
                 f"{name} must be an r3jax.{kind.__name__} ({hint}), got {describe(value)}"
             )
-        # A vmapped constructor makes one object of stacked arrays: only the axes give it away.
+        # A vmapped constructor makes one object of stacked arrays: only the number of axes shows
+        # it.
         if leaf and (found := np.ndim(getattr(value, leaf))) != ndim:
             raise InputError(
                 f"{name} must be one {kind.__name__}, but its {leaf} has {found} axes instead of "
@@ -143,14 +144,14 @@ def describe(value: Any) -> str:
 
 
 def _shape(name: str, value: Any, wanted: str) -> tuple[int, ...]:
-    # Asked by attributes: tracers and the arrays of any library pass, lists do not.
+    # Checked by attributes: tracers and arrays of any library pass, lists do not.
     if not hasattr(value, "shape") or not hasattr(value, "dtype"):
         raise TypeError(f"{name} must be an array {wanted}, got {describe(value)}")
     return tuple(value.shape)
 
 
 def _stacked(shape: tuple[int, ...], wanted: tuple[int, ...]) -> str:
-    # Of all wrong shapes a batch has a cure that the error can name.
+    # For a batch the error can name the remedy.
     if shape[1:] == wanted:
         return f": the call takes one at a time, use jax.vmap over the {shape[0]}"
     return ""

@@ -1,4 +1,4 @@
-"""Views along the world's axes: six directions that show every side of a place alike."""
+"""Views along the world's axes: the six directions of the test views."""
 
 from collections.abc import Sequence
 

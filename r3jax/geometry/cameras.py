@@ -53,11 +53,11 @@ class Camera(eqx.Module):
         """Refuses intrinsics whose rays would be infinite or NaN."""
         if self.width < 1 or self.height < 1:
             raise InputError(f"a camera's image needs pixels, got {self.width} x {self.height}")
-        # Under jit values are not known; `nan_unless_valid` marks what they spoil.
+        # Under jit values are not known; `nan_unless_valid` then makes scores NaN.
         if is_traced(self.fx, self.fy, self.cx, self.cy):
             return
         for name, value in (("fx", float(self.fx)), ("fy", float(self.fy))):
-            # Written as what must hold: NaN fails it, too.
+            # Written as a condition that NaN fails, too.
             if not 0.0 < value < np.inf:
                 raise InputError(f"{name} must be positive and finite [px], got {value}")
         for name, value in (("cx", float(self.cx)), ("cy", float(self.cy))):
@@ -99,7 +99,7 @@ def project(
 
     Returns:
         Pixel coordinates (column, row) and z-depth [m]. Points with depth <= 0 are behind the
-        camera; their pixel coordinates are finite but mean nothing.
+        camera; their pixel coordinates are finite but undefined.
     """
     x, y, z = points_camera[..., 0], points_camera[..., 1], points_camera[..., 2]
     # Divided by a safe number before the choice: the gradient of 1 / 0 would be NaN.
@@ -161,21 +161,21 @@ def pose_along(
         direction: viewing direction in the world, any length but 0.
 
     Returns:
-        `T_world_camera`; not rigid where the direction is 0 (which only jit lets through).
+        `T_world_camera`; not rigid if the direction is 0 (possible only under jit).
 
     Raises:
-        ValueError: shapes other than [3], what is not finite, a direction without length.
+        ValueError: shapes other than [3], values that are not finite, a direction without length.
     """
     position, direction = _point("position", position), _point("direction", direction)
     if not is_traced(direction) and not np.any(np.asarray(direction)):
-        raise InputError("direction has no length: there is nothing to look at")
+        raise InputError("direction has no length: give a vector that is not zero")
     # Only jit lets a zero direction pass: its pose is finite but not rigid, which
     # `nan_unless_valid` notices.
     forward = direction / jnp.maximum(safe_norm(direction), 1e-12)
     # The product of forward and up, so that its z is 0 exactly: level at every pitch.
     right = jnp.stack([forward[1], -forward[0], jnp.zeros_like(forward[0])])
     length = safe_norm(right)
-    # Below this, float32 cannot tell which way is level.
+    # Below this, float32 cannot resolve the level direction.
     is_vertical = length < 1e-6
     # Replaced before the division: the gradient of the branch not taken must be finite, too.
     length_safe = jnp.where(is_vertical, 1.0, length)
@@ -193,12 +193,12 @@ def look_at(
     """Makes the roll-free pose at `position` that looks at `target` (both [m], world).
 
     Raises:
-        ValueError: shapes other than [3], what is not finite, or one and the same point.
+        ValueError: shapes other than [3], values that are not finite, or two equal points.
     """
     position, target = _point("position", position), _point("target", target)
-    # Refused here, where both points can be named: `pose_along` would see a zero direction only.
+    # Refused here, where the error can name both points: `pose_along` only gets a zero direction.
     if not is_traced(position, target) and np.array_equal(position, target):
-        raise InputError("position and target are the same point: there is nothing to look at")
+        raise InputError("position and target are the same point: no viewing direction")
     return pose_along(position, target - position)
 
 
@@ -227,7 +227,7 @@ _LAST_ROW_TOLERANCE = 1e-5
 
 
 def rigid_error(T: np.ndarray) -> str | None:
-    """Says what is wrong with a 4x4 pose, or None if it is rigid and finite. On the host."""
+    """Describes what is wrong with a 4x4 pose; None if it is rigid and finite. On the host."""
     if T.shape != (4, 4):
         return f"a pose is a 4x4 matrix, got shape {T.shape}"
     # First: every comparison below is False for NaN, and the pose would pass.
@@ -262,8 +262,8 @@ def nan_unless_valid(
 ) -> Float[Array, ""]:
     """Returns 1 for a valid view and NaN otherwise: a factor of scores under jit.
 
-    Nothing can be raised there, and a pose that is not rigid sees nothing: it would score 0.
-    `rigid_error` says the same of a pose outside jit.
+    Nothing can be raised there, and the score of a pose that is not rigid would be 0. `rigid_error`
+    is the check outside jit.
 
     Args:
         camera: whose intrinsics must be finite, and its focal lengths positive.
@@ -280,7 +280,7 @@ def nan_unless_valid(
 def is_rigid(T: Float[Array, "4 4"]) -> Bool[Array, ""]:
     """Checks that `rigid_error` finds nothing wrong with a pose."""
     R = T[:3, :3].astype(jnp.float32)
-    # Not a matrix product: on some devices those round to ten bits.
+    # Not a matrix product, which some devices compute with 10-bit mantissas.
     deviation = jnp.sum(R[:, None, :] * R[None, :, :], axis=2) - jnp.eye(3)
     last = T[3].astype(jnp.float32) - jnp.array([0.0, 0.0, 0.0, 1.0])
     return (

@@ -1,4 +1,4 @@
-"""Arithmetic whose gradient stays finite where the plain form's does not."""
+"""Arithmetic with gradients that stay finite at singular points."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float

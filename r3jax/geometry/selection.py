@@ -1,4 +1,4 @@
-"""Selects the few of many that a mask marks: running counts, places, and loops in chunks.
+"""Selects the items that a mask marks: running counts, indices, and loops in chunks.
 
 XLA's `cumsum` on a CPU takes 1.5 ms for the pixels of a 512x512 image; a product with a
 triangular matrix of ones takes a quarter of that and is exact below 2^24.
@@ -20,7 +20,7 @@ from r3jax.errors import InputError
 _BLOCK = 64
 
 SPARE = 64
-"""Places behind an array that is scattered into, for what shall be dropped."""
+"""Number of spare places behind an array, which take the dropped items of a scatter."""
 
 
 def spare_places(size: int, num: int) -> Int[Array, " n"]:
@@ -28,7 +28,7 @@ def spare_places(size: int, num: int) -> Int[Array, " n"]:
 
     On CPUs XLA bounds-checks every element; where the outcome is random, half of the branches are
     mispredicted, which costs more than the write. A write that is always in bounds costs nothing,
-    and spread over some places it need not wait for the one before.
+    and spreading the writes avoids waiting for the previous one.
     """
     return size + jnp.arange(num, dtype=jnp.int32) % SPARE
 
@@ -58,17 +58,17 @@ def _inclusive_sum(x: Array) -> Array:
 def positions_of_set(flags: Bool[Array, " n"], size: int) -> Int[Array, " M"]:
     """Finds the indices of the first `size` set flags, in order; n pads.
 
-    Like `jnp.nonzero(flags, size=size, fill_value=n)`, but quick.
+    Like `jnp.nonzero(flags, size=size, fill_value=n)`, but faster.
     """
     n = flags.shape[0]
-    # Set flags past `size` fall behind the end as well: into the spare places, or dropped.
+    # Set flags beyond `size` also go into the spare places, or are dropped.
     target = jnp.where(flags, running_count(flags) - 1, spare_places(size, n))
     empty = jnp.full(size + SPARE, n, dtype=jnp.int32)
     return empty.at[target].min(jnp.arange(n, dtype=jnp.int32), mode="drop")[:size]
 
 
 CHUNK = 1 << 12
-"""Items of `for_selected` at once: they stay in the cache of one core."""
+"""Chunk size of `for_selected`: a chunk fits in the cache of one core."""
 
 Carry = TypeVar("Carry")
 
@@ -80,17 +80,17 @@ def for_selected(
 ) -> Carry:
     """Calls `body(index, valid, carry) -> carry` for the selected items, a chunk at a time.
 
-    The cost follows the number that are selected, not that of all. `index` holds places of selected
-    items in increasing order; where `valid` is False it is padding (and within bounds). A loop of
-    unknown length: forward derivatives only.
+    The cost depends on the number of selected items only. `index` holds places of selected items in
+    increasing order; where `valid` is False it is padding (and within bounds). The length of the
+    loop is unknown: only forward-mode derivatives.
     """
     num = selected.shape[0]
     size = min(CHUNK, num)
-    # Rounded up to whole chunks, so that the last slice is never shifted back.
+    # Rounded up to whole chunks, so that the last slice is not shifted.
     order = positions_of_set(selected, -(-num // size) * size)
 
-    # Chunks are counted one by one: for a limit that XLA knows and that is no multiple of the
-    # step, it gets the number of turns wrong (one chunk: none).
+    # Chunks are counted one by one: if the limit is a constant and no multiple of the step, XLA
+    # computes a wrong trip count (0 for one chunk).
     def next_chunk(chunk: Int[Array, ""], carry: Carry) -> Carry:
         index = jax.lax.dynamic_slice_in_dim(order, chunk * size, size)
         return body(jnp.minimum(index, num - 1), index < num, carry)

@@ -20,7 +20,7 @@ GOLDEN_RATIO = (1.0 + math.sqrt(5.0)) / 2.0
 def _lattice(num: int) -> np.ndarray:
     # In double precision: the azimuth grows with k, and float32 would lose digits of its turn.
     k = np.arange(num, dtype=np.float64)
-    # The half step keeps the first and the last point off the poles, where azimuth means nothing.
+    # The half step keeps the first and the last point off the poles, where azimuth is undefined.
     z = 1.0 - 2.0 * (k + 0.5) / num
     azimuth = 2.0 * np.pi * k / GOLDEN_RATIO
     radius = np.sqrt(1.0 - z * z)
@@ -49,7 +49,7 @@ def bins_for_angle(angle_deg: float | int) -> int:
     if not 0.0 < angle_deg <= 360.0:
         raise InputError(f"angle_deg must lie in (0, 360], got {angle_deg}")
     cap = 2.0 * math.pi * (1.0 - math.cos(0.5 * math.radians(angle_deg)))
-    # Rounding must not add a bin where the quotient is whole (120 degrees: 4).
+    # Rounding must not add a bin if the quotient is an integer (120 degrees: 4).
     return math.ceil(4.0 * math.pi / cap - 1e-9)
 
 
@@ -115,7 +115,7 @@ def nearest_bin_table(num: int) -> np.ndarray:
     cell, bin = cell[order], bin[order]
     first = np.searchsorted(cell, np.arange(len(center)))
     place = np.arange(len(cell)) - first[cell]
-    # Padding repeats the nearest, so that every row of the table may be tried. Candidates first:
+    # Padding repeats the nearest, so that every row of the table is valid. Candidates come first:
     # `nearest_bin` reads one row of the table at a time.
     table = np.tile(bin[first].astype(np.int32), (int(place.max()) + 1, 1))
     table[place, cell] = bin
@@ -135,7 +135,7 @@ def nearest_bin(directions: Float[Array, "3 n"], num: int) -> Int[Array, " n"]:
     # Below every cosine, rounded or not: the first candidate always wins.
     best = jnp.full(cell.shape, -2.0, dtype=jnp.float32)
     chosen = jnp.zeros(cell.shape, dtype=jnp.int32)
-    # Unrolled: XLA fuses the few steps, and no array of all candidates is written.
+    # Unrolled: XLA fuses the few steps without an array of all candidates.
     for k in range(table.shape[0]):
         candidate = table[k, cell]
         cosine = sum(lattice[axis, candidate] * directions[axis] for axis in range(3))

@@ -16,7 +16,7 @@ INDEX_LIMIT = 1 << 20
 """Voxel indices lie in [-INDEX_LIMIT, INDEX_LIMIT)."""
 
 MAX_COORDINATE = float(1 << 15)
-"""Beyond it float32 no longer tells 2 mm apart [m]."""
+"""Largest coordinate [m]; beyond it float32 steps exceed 2 mm."""
 
 EMPTY_WORD = 0xFFFFFFFF
 """Both words of an empty row. No voxel packs to it: the top bit of a packed key is 0."""
@@ -31,7 +31,7 @@ def check_near_origin(name: str, points: np.ndarray, limit: float = MAX_COORDINA
     largest = float(np.abs(points).max(initial=0.0))
     if largest > limit:
         raise InputError(
-            f"{name} has the coordinate {largest:,.0f} m, {limit:,.0f} m is the most: subtract an "
+            f"{name} has the coordinate {largest:,.0f} m, the limit is {limit:,.0f} m: subtract an "
             "origin near the cameras from all coordinates, in float64"
         )
 
@@ -74,7 +74,7 @@ def unpack(
 ) -> tuple[Int[Array, "*n"], Int[Array, "*n"], Int[Array, "*n"]]:
     """Unpacks the indices from a key: the inverse of `pack`.
 
-    Empty rows give indices without meaning.
+    The indices of empty rows are undefined.
     """
     mask21 = jnp.uint32((1 << 21) - 1)
     ux = low & mask21

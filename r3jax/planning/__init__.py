@@ -1,1 +1,1 @@
-"""Where to go: candidates, travel over known free space, policies."""
+"""Planning: candidates, paths through known free space, policies."""

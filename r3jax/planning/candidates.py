@@ -1,10 +1,10 @@
-"""Views on offer, and where they could be taken from. On the host: NumPy.
+"""Candidate views, and the positions that they are drawn from. On the host: NumPy.
 
 Positions lie in cells where the robot may stop (`Travel.goals`), away from the cell's faces: at
 most a quarter of a cell from its center.
 
-Shape symbols: X Y Z cells along the axes; C candidates; n positions; c places to choose from; p
-places chosen.
+Shape symbols: X Y Z cells along the axes; C candidates; n positions; c positions to choose from; p
+positions chosen.
 """
 
 from typing import Any
@@ -24,47 +24,47 @@ JITTER = 0.25
 """Positions lie at most this far from their cell's center, along each axis [cells]."""
 
 _NEIGHBORS = 256
-"""A region of interest is looked at from one of this many nearest cells."""
+"""A region of interest is viewed from one of this number of nearest cells."""
 
 _poses_along = jax.jit(jax.vmap(pose_along))  # compiled once per number of candidates
 
 _AHEAD = (1.0, 0.0, 0.0)
-"""Direction of a candidate that has none yet: what scores panoramas turns it."""
+"""Placeholder direction of a candidate whose direction the panorama will choose."""
 
 VIEW_DISTANCE = (0.3, 2.0)
-"""A region of interest is looked at from between these distances [m] (Active-GS)."""
+"""Minimum and maximum distance from which a region of interest is viewed [m] (Active-GS)."""
 
 
 class Candidates(eqx.Module):
-    """Views on offer, without roll, from drawing to choice; 4x4 matrices are made at the edges.
+    """Candidate views without roll.
 
-    A run scores the same number in every decision, so that scoring compiles once: where fewer can
-    be drawn, `padded` adds rows that are not valid.
+    Every decision of a run scores the same number of candidates, so that scoring compiles once: if
+    fewer can be drawn, `padded` adds invalid rows.
     """
 
     position: Float[np.ndarray, "C 3"]
-    """Camera centers in the world [m]; float64, because a path ends exactly there."""
+    """Camera centers in the world [m]; float64, because paths end exactly there."""
 
     direction: Float[np.ndarray, "C 3"]
-    """Lines of sight, world, of any length but 0: scaling would round them."""
+    """Viewing directions, world, of any length but 0 (normalizing would round them)."""
 
     valid: Bool[np.ndarray, " C"]
-    """False for padding: it repeats views that are valid, and is never chosen."""
+    """False for padding, which repeats valid views and is never chosen."""
 
     @property
     def axis(self) -> Float[np.ndarray, "C 3"]:
-        """Unit vectors along the lines of sight."""
-        # Worked out on demand: the directions themselves keep the bits they were drawn with.
+        """Viewing directions as unit vectors."""
+        # Computed on demand: the directions themselves keep their bits.
         return self.direction / np.linalg.norm(self.direction, axis=1, keepdims=True)
 
     @property
     def num_valid(self) -> int:
-        """Number of views that are on offer."""
+        """Number of valid views."""
         return int(np.count_nonzero(self.valid))
 
     @property
     def T_world_camera(self) -> Float[np.ndarray, "C 4 4"]:
-        """Poses for the host, float64, at the very positions."""
+        """Poses for the host, float64, at exactly these positions."""
         return poses_along(self.position, self.direction)
 
     def poses_on_device(self) -> Float[Array, "C 4 4"]:
@@ -79,11 +79,11 @@ class Candidates(eqx.Module):
         return jax.tree.map(lambda x: x[index], self)
 
     def padded(self, num: int) -> "Candidates":
-        """Repeats rows up to `num` in all; the repeats are not valid. None at all stay none."""
+        """Repeats rows up to `num` in total; the repeats are not valid. Zero rows stay zero."""
         if not len(self.valid):
             return self
         rows = np.arange(num)
-        # Repeats, not zeros: padding must not widen the box that voxels are gathered for.
+        # Repeats, not zeros: padding must not enlarge the box from which voxels are gathered.
         repeated = self.take(rows % len(self.valid))
         return eqx.tree_at(lambda c: c.valid, repeated, repeated.valid & (rows < len(self.valid)))
 
@@ -103,7 +103,7 @@ def host_generator(key: Array) -> np.random.Generator:
 
     Host code draws many small arrays of odd sizes.
     """
-    # Both kinds of JAX keys are welcome, old arrays of words and typed ones.
+    # Takes both kinds of JAX keys: arrays of words, and typed keys.
     is_typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     return np.random.default_rng(np.asarray(jax.random.key_data(key) if is_typed else key))
 
@@ -111,11 +111,11 @@ def host_generator(key: Array) -> np.random.Generator:
 def random_views(
     travel: Travel, scoring_grid: OccupancyGrid, config: PlannerConfig, *, key: Array
 ) -> Candidates:
-    """Draws C views: local ones look anywhere, those drawn for the frontier look at it."""
+    """Draws C views: local ones in random directions, those for the frontier towards it."""
     position_key, direction_key = jax.random.split(key)
     positions, aims = draw_positions(travel, scoring_grid, config, key=position_key)
     directions = random_directions(len(positions), key=direction_key)
-    # Directions are drawn for all rows, aimed or not: recorded runs hold to this stream.
+    # Directions are drawn for all rows, so that recorded runs can be repeated.
     is_aimed = np.isfinite(aims[:, :1])
     drawn = candidates_along(positions, np.where(is_aimed, aims - positions, directions))
     return drawn.padded(config.num_candidates)
@@ -125,17 +125,17 @@ def random_places(
     travel: Travel, scoring_grid: OccupancyGrid, config: PlannerConfig, *, key: Array
 ) -> Candidates:
     """Draws the positions of `random_views` for a score that finds the directions."""
-    # The same half of the key as there: both draw the same positions.
+    # The same half of the key as in `random_views`: both draw the same positions.
     position_key, _ = jax.random.split(key)
     positions, _ = draw_positions(travel, scoring_grid, config, key=position_key)
     return candidates_at(positions).padded(config.num_candidates)
 
 
 def free_views(travel: Travel, num: int, radius: float, *, key: Array) -> Candidates:
-    """Draws `num` views from safe places within `radius` of the robot, looking anywhere.
+    """Draws `num` views in random directions from safe positions within `radius` of the robot.
 
     Returns:
-        `num` candidates; none if the robot can stop nowhere.
+        `num` candidates; none if the robot cannot stop anywhere.
     """
     position_key, direction_key = jax.random.split(key)
     positions = local_random(travel, num, radius, key=position_key)
@@ -156,23 +156,23 @@ def draw_positions(
     Args:
         travel: where the robot can go.
         scoring_grid: the grid without hopeless unexplored cells (`mask_unexplorable`).
-        config: how many, and how near.
+        config: number and radius.
         key: source of randomness.
 
     Returns:
-        Positions [n, 3] and the frontier cell each one is meant for [n, 3] (NaN for local
-        ones), float64 [m]; fewer than `num_candidates` if there is no local one, [0, 3] if the
-        robot can stop nowhere.
+        Positions [n, 3] and the frontier cell of each [n, 3] (NaN for local ones), float64 [m];
+        fewer than `num_candidates` if there is no local one, [0, 3] if the robot cannot stop
+        anywhere.
     """
     frontier_key, local_key = jax.random.split(key)
-    # Of the masked grid: a frontier that cannot be passed is none.
+    # Of the masked grid: a boundary that cannot be crossed is not a frontier.
     targets = np.asarray(frontier(scoring_grid))
     positions, aims = region_of_interest(travel, targets, config.num_frontier, key=frontier_key)
-    # What the frontier leaves goes to local positions: every decision scores the same number.
+    # The rest are local positions, so that every decision scores the same number.
     local = local_random(
         travel, config.num_candidates - len(positions), config.radius, key=local_key
     )
-    # Local views have no aim; NaN keeps the two arrays row by row alike.
+    # Local views have no target cell; NaN keeps the rows of both arrays aligned.
     aims = np.concatenate([aims, np.full_like(local, np.nan)])
     return np.concatenate([positions, local]), aims
 
@@ -188,7 +188,7 @@ def local_random(travel: Travel, num: int, radius: float = 0.5, *, key: Array) -
         [num, 3] float64 [m]; [0, 3] if there is no such cell.
     """
     rng = host_generator(key)
-    # Drawn by cell, not by volume: free space is made of cells, however odd its shape.
+    # Drawn by cell, which works for free space of any shape.
     cells = np.argwhere(travel.goals)
     # With a small radius even the center of the robot's own cell may lie outside of it.
     is_own = np.all(cells == np.array(travel.start_cell), axis=1)
@@ -197,15 +197,15 @@ def local_random(travel: Travel, num: int, radius: float = 0.5, *, key: Array) -
     cells, is_own = cells[is_near], is_own[is_near]
     if len(cells) == 0:
         return np.zeros((0, 3))
-    # With repetition: near walls there may be fewer cells than candidates.
+    # With replacement: near walls there may be fewer cells than candidates.
     chosen = rng.integers(len(cells), size=num)
-    # Stops, not centers: a robot with a range of heights cannot be at every center.
+    # Stop positions, not centers: a robot with a range of heights cannot be at every center.
     centers = travel.stops(cells[chosen])
     positions = _jitter(centers, travel.cell_size, rng)
     is_far = np.linalg.norm(positions - travel.start, axis=1) > radius
-    # Jitter may leave the radius: the center of the cell never does.
+    # Jitter may leave the radius; the center of the cell does not.
     positions[is_far] = centers[is_far]
-    # In a cell that is too tight for the margin, only the present place is known to fit.
+    # In a cell without the margin, only the present position is known to fit.
     if not travel.safe[travel.start_cell]:
         positions[is_own[chosen]] = travel.start
     return positions
@@ -222,8 +222,8 @@ def region_of_interest(
 
     Args:
         travel: where the robot may stop.
-        targets: free cells worth looking at, such as the frontier, [X, Y, Z] bool.
-        num: positions wanted.
+        targets: free cells to view, such as the frontier, [X, Y, Z] bool.
+        num: number of positions.
         key: source of randomness.
 
     Returns:
@@ -251,7 +251,7 @@ def region_of_interest(
 def _stops_round(travel: Travel, target: np.ndarray) -> np.ndarray:
     """Finds the nearest cells to stop in, at a distance from which to view `target`.
 
-    Asks a window round the target only: the work does not grow with the scene.
+    Searches a window around the target only: the cost does not grow with the scene.
 
     Returns:
         Indices of cells, [n, 3], n <= 256.
@@ -260,32 +260,33 @@ def _stops_round(travel: Travel, target: np.ndarray) -> np.ndarray:
     from r3jax.kernels.robot.cells import nearest_in_ring
 
     reach = int(np.ceil(VIEW_DISTANCE[1] / travel.cell_size))
-    # Cut after the nearest are taken, so that a near wall leaves few places, not far ones.
+    # Filtered after taking the nearest, so that a near wall leaves few positions, not far ones.
     return nearest_in_ring(
         travel.goals, target, reach, travel.cell_size, *VIEW_DISTANCE, _NEIGHBORS
     )
 
 
 def spread(places: np.ndarray, num: int) -> np.ndarray:
-    """Selects up to `num` places, each the farthest from those before (Gonzalez 1985).
+    """Selects up to `num` positions, each the farthest from those before (Gonzalez 1985).
 
-    The first is the one nearest to the middle of all: it does not depend on their order, but for
-    ties.
+    The first is the one nearest to the middle of all, which does not depend on their order, except
+    for ties.
 
     Args:
         places: [c, 3], c >= 1.
         num: p at most.
     """
-    # The middle, not a random place: the choice must not depend on a seed or an order.
+    # The middle, not a random position: the choice must not depend on a seed or an order.
     first = int(np.argmin(np.linalg.norm(places - places.mean(axis=0), axis=1)))
     chosen = [first]
     gap = np.linalg.norm(places - places[first], axis=1)
     while len(chosen) < min(num, len(places)):
         farthest = int(np.argmax(gap))
         if gap[farthest] <= 0.0:
-            break  # the rest repeats what is there
+            break  # the rest are repeats
         chosen.append(farthest)
-        # Only the newest place can shorten a gap: p passes over c places, no table of all pairs.
+        # Only the newest position can reduce a distance: p passes over c positions, no table of all
+        # pairs.
         gap = np.minimum(gap, np.linalg.norm(places - places[farthest], axis=1))
     return np.asarray(chosen)
 
@@ -302,19 +303,19 @@ def random_directions(num: int, *, key: Array) -> np.ndarray:
     Not bounded in elevation: floors and ceilings are part of the scene, and test views look
     straight up and down too.
     """
-    # Normal numbers favor no direction; uniform angles would crowd at the poles.
+    # Normalized normal vectors are uniform; uniform angles would cluster at the poles.
     directions = host_generator(key).normal(size=(num, 3))
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
 def poses_along(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Makes roll-free poses [n, 4, 4] float64 at positions [n, 3] along directions [n, 3]."""
-    # The function that scoring uses, too: a second formula would differ in the last bits.
+    # The function that scoring uses: another formula would differ in the last bits.
     poses = _poses_along(
         jnp.asarray(positions, dtype=jnp.float32), jnp.asarray(directions, dtype=jnp.float32)
     )
     exact = np.array(poses, dtype=np.float64)
-    exact[:, :3, 3] = positions  # not rounded to float32: a path ends exactly there
+    exact[:, :3, 3] = positions  # not rounded to float32: paths end exactly there
     return exact
 
 
@@ -328,15 +329,15 @@ def best_views(candidates: Candidates, panorama: Any) -> tuple[Candidates, np.nd
     Returns:
         The candidates, and the scores of those directions, [C] float64.
     """
-    # As the panorama has it, not scaled again: the pose is then bit for bit the one it scored.
+    # Not normalized again: the pose is then bit-identical to the scored one.
     direction = np.asarray(panorama.best_direction, dtype=np.float64)
     turned = eqx.tree_at(lambda c: c.direction, candidates, direction)
     return turned, np.asarray(panorama.best_score, dtype=np.float64)
 
 
 def path_lengths(travel: Travel, candidates: Candidates) -> np.ndarray:
-    """Measures the path to each candidate, [C] [m]; inf where there is none, and for padding."""
-    # Padding is not asked about: it is never chosen, and each length walks through the grid.
+    """Computes the path length to each candidate, [C] [m]; inf without a path and for padding."""
+    # Padding is skipped: it is never chosen, and each length takes a walk through the grid.
     lengths = np.full(len(candidates.valid), np.inf)
     lengths[candidates.valid] = travel.lengths(candidates.position[candidates.valid])
     return lengths

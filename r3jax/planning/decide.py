@@ -1,8 +1,8 @@
-"""A decision in the order of time: look round, draw, make feasible, score, weigh, choose.
+"""The steps of a decision, in order: survey, draw, make feasible, score, weigh, choose.
 
-A policy is how it draws and how it scores; all else of a decision is here, for every policy. What
-is drawn, and what scoring turns, becomes the nearest view that the robot may take: no policy has to
-know the robot.
+A policy defines how candidates are drawn and scored; everything else is here, for every policy.
+Drawn and turned views are projected to the nearest view that the robot may take, so that policies
+need not know the robot.
 
 Shape symbols: X Y Z cells of the grid; C candidates; K waypoints.
 """
@@ -42,39 +42,39 @@ MAX_FAILED_LOOKS = 3
 behind a window, where the depth sensor fails, or where hits and passes cancel out."""
 
 NEW_PLACE, NEW_DIRECTION = 1.0, 45.0
-"""A view this far from all others [m], or turned by so much [degrees], is a new one."""
+"""A view is new if it is this far from all others [m], or turned by this angle [degrees]."""
 
 SHUT_IN_VIEWS, SHUT_IN_STEP = 6, 0.3
-"""A robot whose latest views all lie within such a step [m] is shut in, if no path leads out."""
+"""A robot is shut in if its latest views lie within this distance [m] and no path leads farther."""
 
 RECONSIDERED = 8
-"""Candidates of an earlier decision that are scored again."""
+"""Number of candidates of an earlier decision that are scored again."""
 
 Scored = tuple[Candidates, dict[str, np.ndarray]]
-"""Candidates, turned if the policy turns them, and numbers of each [C]."""
+"""Candidates, turned if the policy turns them, and their scores [C]."""
 
 
 class PlannerState(eqx.Module):
-    """What a policy of this package remembers between decisions."""
+    """The memory of this package's policies between decisions."""
 
     camera: Camera
-    """The camera of every frame to come."""
+    """The camera."""
 
     trail: Bool[np.ndarray, "X Y Z"] = eqx.field(converter=np.asarray)
-    """Cells that the robot has come through: the path back if it finds itself shut in."""
+    """Cells that the robot has passed: the path back if it is shut in."""
 
     looks: Int[np.ndarray, "X Y Z"] = eqx.field(converter=np.asarray)
-    """Views that should have shown each cell and left it unexplored."""
+    """Number of views that should have shown each cell but left it unexplored."""
 
     start_height: Float[Array, ""] | None = None
     """Height of the first view [m], NaN before it; None for a motion whose heights do not count
     from it."""
 
     memory: Any = None
-    """Arrays that one policy keeps beside the map: a pytree of its own."""
+    """The policy's own memory, a pytree."""
 
     taken: Float[np.ndarray, "V 6"] | None = None
-    """Positions and lines of sight of the views that were taken; None for a free-flying camera."""
+    """Positions and viewing directions of the views taken so far; None for a free-flying camera."""
 
 
 @dataclass(frozen=True)
@@ -82,49 +82,49 @@ class Drawn:
     """The candidates of one decision."""
 
     candidates: Candidates
-    """Views on offer; none of them valid: there is nothing to choose from."""
+    """The candidates; if none is valid, there is nothing to choose from."""
 
     memory: Any
-    """What the policy keeps beside the map, after drawing."""
+    """The policy's memory after drawing."""
 
     notes: Any = None
-    """What `score`, `weigh` and `conclude` need of the candidates; not kept."""
+    """Notes on the candidates for `score`, `weigh` and `conclude`; not stored."""
 
 
 @dataclass(frozen=True)
 class Rule:
-    """How a policy decides: what it offers, and how it compares."""
+    """The functions of a policy: how it draws and compares candidates."""
 
     draw: Callable[..., Drawn]
-    """The candidates in a situation; takes a `key`."""
+    """Draws the candidates in a situation; takes a `key`."""
 
     score: Callable[..., Scored]
-    """From a situation and candidates to those, turned or not, and numbers of each; takes a
-    `key`. None valid any more: the policy has seen enough."""
+    """Scores candidates: returns them, possibly turned, with their scores; takes a `key`. If none
+    is valid any more, the policy has seen enough."""
 
     weigh: Callable[[dict[str, np.ndarray]], np.ndarray]
-    """From those numbers, and `path` [C], to the totals [C]."""
+    """Computes the totals [C] from the scores and `path` [C]."""
 
     conclude: Callable[[Situation, Candidates, dict[str, np.ndarray], int], Any] = (
         lambda situation, candidates, utilities, best: situation.memory
     )
-    """The memory after a candidate was chosen."""
+    """Returns the memory after a candidate was chosen."""
 
 
 @dataclass(frozen=True)
 class GreedyPolicy(ABC):
     """Draws candidates, scores them, weighs the path, takes the best.
 
-    A policy says how it scores, and if need be how it draws, weighs and concludes.
+    Subclasses define `score`, and if needed `draw`, `weigh` and `conclude`.
     """
 
     config: PlannerConfig = field(default_factory=PlannerConfig)
 
     name: ClassVar[str]
-    """As users write it."""
+    """Its name on the command line."""
 
     source: ClassVar[str]
-    """Where the rule comes from."""
+    """Source of the rule."""
 
     Config: ClassVar[type[PlannerConfig]] = PlannerConfig
     """Its settings."""
@@ -171,7 +171,7 @@ class GreedyPolicy(ABC):
         return initial_state(camera, grid, memory, self.config.motion)
 
     def observe(self, state: PlannerState, map_state: MapState, frame: Frame) -> PlannerState:
-        """Leaves the state unchanged: the map contains all that most policies need of a frame."""
+        """Returns the state unchanged: most policies need nothing of a frame but the map."""
         del map_state, frame
         return state
 
@@ -184,7 +184,7 @@ class GreedyPolicy(ABC):
         *,
         key: Array,
     ) -> tuple[Decision | None, PlannerState, PlanInfo]:
-        """Chooses the candidate with the greatest total, of those that the robot may take."""
+        """Chooses the feasible candidate with the greatest total."""
         rule = Rule(self.draw, self.score, self.weigh, self.conclude)
         return decide(rule, (state, map_state, grid, T_world_camera), self.config, key=key)
 
@@ -198,7 +198,7 @@ class GreedyPolicy(ABC):
         *,
         key: Array,
     ) -> tuple[Decision | None, PlannerState, PlanInfo]:
-        """Decides again among the best candidates of a decision that was made on less.
+        """Decides again among the best candidates of a decision that was made on an earlier map.
 
         The decision is None if no path leads to any of them.
         """
@@ -219,7 +219,7 @@ class GreedyPolicy(ABC):
         T_world_camera: np.ndarray,
         waypoints: np.ndarray,
     ) -> PlannerState:
-        """Records the cells on the path, and counts those that the latest view failed to show."""
+        """Records the cells on the path, and counts cells that the latest view failed to show."""
         state, situation = look_round(state, map_state, grid, T_world_camera, self.config)
         return with_path(state, situation.travel, waypoints)
 
@@ -234,13 +234,14 @@ def decide(
     """Makes one decision, from drawing to choice.
 
     Args:
-        rule: of the policy.
-        known: what it decides on.
+        rule: functions of the policy.
+        known: memory, map, grid and pose.
         config: its settings.
         key: randomness of this decision.
 
     Returns:
-        The decision, or None where no view can be reached; the memory, and what happened.
+        The decision, or None if no view can be reached; the memory; and information on the
+        decision.
     """
     stopwatch = Stopwatch()
     # Two keys: a policy that draws more must not change the random numbers of its scores.
@@ -254,40 +255,40 @@ def decide(
     with stopwatch.part("candidates"):
         drawn = rule.draw(situation, key=draw_key)
         situation = replace(situation, memory=drawn.memory, notes=drawn.notes)
-    # What drawing noted is kept in any case, so that a resumed run remembers the same.
+    # The memory after drawing is kept in any case, so that a resumed run is the same.
     state = replace(state, memory=drawn.memory)
-    # No view on offer is an outcome, not an error: the loop ends with the reason.
+    # Having no candidates is an outcome, not an error: the loop ends with the reason.
     if not drawn.candidates.valid.any():
         return None, state, _nothing_in_reach(situation, config, stopwatch)
 
     with stopwatch.part("scoring"):
-        # Before scoring, so that what is scored is what is taken; after it, because a score may
-        # have turned the views.
+        # Projected before scoring, so that the scored view is the one taken; and after it, because
+        # scoring may have turned the views.
         feasible = limits.project_to_feasible(drawn.candidates)
         candidates, utilities = rule.score(situation, feasible, key=score_key)
         candidates = limits.project_to_feasible(candidates)
     if not candidates.valid.any():  # the policy has seen enough
         num = drawn.candidates.num_valid
-        reason = f"the policy has no use for any of {num} candidates: it has seen enough"
+        reason = f"none of {num} candidates adds anything: the policy has seen enough"
         info = PlanInfo(DecisionOutcome.NO_CANDIDATE, num, num, stopwatch.seconds, reason)
         return None, state, info
 
     with stopwatch.part("travel"):
-        # After the projection, which may change heights: the paths lead to views on offer.
+        # After the projection, which may change heights: paths must lead to the final views.
         path = limits.path_costs(path_lengths(travel, candidates), candidates.direction)
-    # What was drawn is within reach; what was drawn before the last view may not be.
+    # New candidates are feasible; those drawn before the last view may not be.
     if not np.isfinite(path).any():
         return None, state, _nothing_in_reach(situation, config, stopwatch)
     utilities = utilities | {"path": path}
     gain = utilities.get("utility")
     if stands(config.motion) and state.taken is not None and gain is not None:
-        # Camera and floor tie such a robot to few views of a place: what they cannot show would
-        # draw it to where it is for as long as it runs.
+        # Such a robot has few views of a place: unexplored cells that none of them shows would keep
+        # it there.
         utilities["utility"] = gain * novelty(candidates, state.taken)
     utilities = utilities | {"total": rule.weigh(utilities)}
 
     with stopwatch.part("travel"):
-        # Padding has an infinite path too, so that it can never win.
+        # Padding has an infinite path, so that it is never chosen.
         best = int(np.argmax(np.where(np.isfinite(path), utilities["total"], -np.inf)))
         decision = _decision_for(best, candidates, utilities, travel, limits)
     memory = rule.conclude(situation, candidates, utilities, best)
@@ -305,30 +306,31 @@ def look_round(
     T_world_camera: np.ndarray,
     config: PlannerConfig,
 ) -> tuple[PlannerState, Situation]:
-    """Finds where the robot can go, its possible moves, and which cells can be explored.
+    """Finds the reachable space, the allowed views, and the cells that can be explored.
 
     Args:
         state: the policy's memory.
-        map_state: the map, the view from here included.
-        grid: the grid, the same.
+        map_state: the map, including the latest view.
+        grid: the grid,
+            including the latest view.
         T_world_camera: where the latest view was taken.
-        config: the safety margin, the robot, and how far it sees.
+        config: the safety margin, the robot, and the range of its sensor.
 
     Returns:
-        The memory with the view from here counted in, and the situation. Cells that no robot can
-        look at, and those that several views left unexplored, do not count in its `scoring_grid`.
+        The memory, updated by the latest view, and the situation. Its `scoring_grid` leaves out
+        cells that the robot can never see, and those that several views left unexplored.
     """
-    # float64: in float32 a robot on a border of cells could stand in either of them, and waypoints
-    # begin exactly where the robot is.
+    # float64: in float32 a robot on a border of cells could be in either, and waypoints begin
+    # exactly at the robot.
     pose = np.asarray(T_world_camera, dtype=np.float64)
     state = _with_start(state, pose[2, 3])
     motion, start = config.motion, state.start_height
     # Heights count from the first view, or a robot would creep up by its range each time.
     heights = motion.heights_from(0.0 if start is None else float(start))
     if stands(motion) and motion.is_relative and heights[0] == heights[1]:
-        heights = float(pose[2, 3]), float(pose[2, 3])  # on a ramp the floor carries it
+        heights = float(pose[2, 3]), float(pose[2, 3])  # on a ramp the floor changes its height
     travel = travel_of(motion.body, grid, map_state, pose, config, state, heights)
-    # What this view should have shown: if it is still unexplored, the look has failed.
+    # Cells that this view should have shown, but that are still unexplored.
     visible = visible_unexplored(
         map_state, grid, state.camera, jnp.asarray(T_world_camera, jnp.float32), config.scoring
     )
@@ -336,7 +338,7 @@ def look_round(
     if state.taken is not None:
         view = np.concatenate([pose[:3, 3], pose[:3, 2]]).astype(np.float32)[None]
         state = replace(state, taken=np.concatenate([state.taken, view]))
-    # After that many, more would not help, and the utility would never stop calling for them.
+    # More views would not help, and the cells would keep their utility forever.
     is_exhausted = state.looks >= MAX_FAILED_LOOKS
     scoring_grid = mask_unexplorable(grid, travel.reachable, is_exhausted)
     limits = Limits(motion, pose, travel.heights)
@@ -346,11 +348,11 @@ def look_round(
 
 
 def novelty(candidates: Candidates, taken: np.ndarray) -> np.ndarray:
-    """Measures how new candidates are beside all views that were taken, [C]: 0 (the same) to 1.
+    """Measures the novelty of candidates against all views taken, [C]: 0 (the same) to 1.
 
     Args:
-        candidates: views on offer.
-        taken: positions and unit lines of sight, [V, 6].
+        candidates: the candidates.
+        taken: positions and unit viewing directions, [V, 6].
     """
     gap = np.linalg.norm(candidates.position[:, None] - taken[None, :, :3], axis=2) / NEW_PLACE
     cosine = np.clip(candidates.axis @ taken[:, 3:].T.astype(np.float64), -1.0, 1.0)
@@ -367,7 +369,7 @@ def travel_of(
     state: PlannerState,
     heights: tuple[float, float],
 ) -> Travel:
-    """Finds where a body can go from a pose [4, 4], in the form that its kind needs."""
+    """Plans travel from a pose [4, 4], for a sphere or a footprint."""
     position, trail = pose[:3, 3], state.trail
     if not isinstance(body, Body):
         return plan_travel(grid, position, config.safety_margin, trail, heights, body)
@@ -389,7 +391,7 @@ def explain_path(
     waypoints: np.ndarray,
     config: PlannerConfig,
 ) -> tuple[PlannerState, Explanation]:
-    """Follows a path [K, 3], and explains the utility of the view at its end when it was chosen."""
+    """Explains the utility of the view at the end of a path [K, 3], as of its choice."""
     state, situation = look_round(state, map_state, grid, T_world_camera, config)
     pose = jnp.asarray(T_chosen, dtype=jnp.float32)
     explanation = explain_view(
@@ -405,8 +407,8 @@ def best_of(planned: Decision) -> tuple[Candidates, np.ndarray]:
     """
     finite = np.isfinite(planned.utilities["path"])
     total = np.where(finite, planned.utilities["total"], -np.inf)
-    # A policy that ranks fewer (`r3-ahead`: where its best paths begin) fills up with the first
-    # that were drawn.
+    # A policy that ranks fewer (`r3-ahead`: the beginnings of its best paths) is padded with the
+    # first drawn.
     best = np.argsort(-total, kind="stable")[:RECONSIDERED]
     poses = planned.candidates[best]
     views = candidates_along(poses[:, :3, 3], poses[:, :3, 2]).padded(RECONSIDERED)
@@ -429,17 +431,17 @@ def net_utility(
         utility: of each candidate.
         path: length of the path to it, or its cost; inf: unreachable.
         lambda2: weight of the path.
-        among: utilities and paths of the candidates that the sums are over; None: these.
+        among: utilities and paths of the candidates to sum over; None: these.
     """
-    # Shares of sums: utility and path become comparable without units.
+    # Shares of sums make utility and path comparable, without units.
     wholes = (utility, path) if among is None else among
     counts, is_reachable = np.isfinite(wholes[1]), np.isfinite(path)
     shares: list[np.ndarray] = []
     for values, whole in zip((utility, path), wholes, strict=True):
         values = np.where(is_reachable, np.asarray(values, dtype=np.float64), 0.0)
-        # One infinite path in the sum would take the share of every other to 0.
+        # An infinite path in the sum would make every share 0.
         total = np.where(counts, np.asarray(whole, dtype=np.float64), 0.0).sum()
-        # A sum of 0 tells no candidate from another: its term is left out, not infinite.
+        # A sum of 0 does not distinguish candidates: its term is left out, not infinite.
         shares.append(values / (total or 1.0))
     return np.where(is_reachable, shares[0] - lambda2 * shares[1], -np.inf)
 
@@ -451,21 +453,21 @@ def initial_state(
     nowhere = np.zeros(grid.log_odds.shape, dtype=bool)
     looks = np.zeros(grid.log_odds.shape, dtype=np.int32)
     is_relative = motion is not None and motion.is_relative
-    # NaN, not None, until the first view: the tree of arrays keeps its structure from there on.
+    # NaN, not None, until the first view, so that the structure of the pytree stays the same.
     start_height = jnp.asarray(jnp.nan, dtype=jnp.float32) if is_relative else None
-    # A free camera has none, so that its memory stays as earlier versions stored it.
+    # None for a free camera, as stored by earlier versions.
     taken = None if motion is None or motion == Motion() else np.zeros((0, 6), np.float32)
     return PlannerState(camera, nowhere, looks, start_height, memory, taken)
 
 
 def with_path(state: PlannerState, travel: Travel, waypoints: np.ndarray) -> PlannerState:
     """Adds the cells of a path over waypoints [K, 3] [m] to the trail."""
-    # All cells that the lines cross, not the waypoints alone: the path back must be connected.
+    # All cells that the lines cross, not only the waypoints: the path back must be connected.
     return replace(state, trail=state.trail | travel.cells_along(waypoints))
 
 
 def _with_start(state: PlannerState, height: float) -> PlannerState:
-    """Notes the height [m] of the first view, if that has not been done."""
+    """Records the height [m] of the first view, if it is not known yet."""
     start = state.start_height
     if start is None or not np.isnan(start):
         return state
@@ -481,9 +483,9 @@ def _decision_for(
 ) -> Decision:
     """Builds the decision for candidate `best`: the path to it, and the other candidates."""
     waypoints = travel.path(candidates.position[best])
-    # Measured again: shortcuts may have made the path shorter than the length that was weighed.
+    # Computed again: shortcuts may have shortened the path.
     length = float(np.linalg.norm(np.diff(waypoints, axis=0), axis=1).sum())
-    # The edge: matrices for rendering and recording, without the padding.
+    # Matrices for rendering and recording, without the padding.
     poses, on_offer = candidates.T_world_camera, candidates.valid
     return Decision(
         T_world_camera=poses[best],
@@ -497,16 +499,16 @@ def _decision_for(
 
 
 def stands(motion: Motion) -> bool:
-    """Tells a robot or a person with a footprint on the floor from what flies."""
+    """Returns True for a body that stands on the floor, False for a flying camera."""
     return isinstance(motion.body, Body) and motion.body.heights is not None
 
 
 def is_shut_in(travel: Travel, taken: np.ndarray) -> bool:
-    """Checks if the latest views were all taken within a step, and no path leads farther.
+    """Checks if the latest views are all within a step, and no path leads farther.
 
     Args:
         travel: where the robot can go.
-        taken: positions and lines of sight of the views so far, [V, 6].
+        taken: positions and viewing directions of the views so far, [V, 6].
     """
     if len(taken) < SHUT_IN_VIEWS:
         return False
@@ -520,10 +522,10 @@ def is_shut_in(travel: Travel, taken: np.ndarray) -> bool:
 def _nothing_in_reach(
     situation: Situation, config: PlannerConfig, stopwatch: "Stopwatch", *, is_shut_in: bool = False
 ) -> PlanInfo:
-    """Reports that no candidate was found: safe places exist, or not even those."""
+    """Reports why there is no candidate: no path to the safe positions, or no safe position."""
     travel = situation.travel
     centers = travel.centers(np.argwhere(travel.safe))
-    # Safe places within the radius that no path leads to are told from none at all.
+    # Distinguishes safe but unreachable positions within the radius from none at all.
     near = np.linalg.norm(centers - travel.start, axis=1) <= config.radius
     outcome = DecisionOutcome.NO_REACHABLE_CANDIDATE if near.any() else DecisionOutcome.NO_CANDIDATE
     if is_shut_in:
@@ -533,13 +535,13 @@ def _nothing_in_reach(
 
 
 def explain_confinement(situation: Situation, config: PlannerConfig) -> tuple[str, dict[str, int]]:
-    """Says what closes the space round the robot, in words and in numbers of cells or columns."""
+    """Explains what closes the space around the robot; also returns numbers of cells or columns."""
     travel, grid, body = situation.travel, situation.grid, config.motion.body
     if not travel.contains(travel.start_cell):
         counts = {"outside": 1}
         return (
             f"the camera at {travel.start.round(2).tolist()} m is outside of the bounds of the "
-            "planner: give `start` a box that holds the robot", counts,
+            "planner: give `start` a box that contains the robot", counts,
         )  # fmt: skip
     extra: dict[str, int] = {}
     reach = travel.room.needed if travel.room is not None else config.safety_margin
@@ -598,5 +600,5 @@ class Stopwatch:
         """Adds the time spent in a `with` block to a part."""
         begin = time.perf_counter()
         yield
-        # Added, not set: travel is timed before the scores and once more after them.
+        # Added, not set: travel is timed both before and after scoring.
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
