@@ -1,8 +1,8 @@
 """Compiles for the next size of a map before it is needed.
 
-A table that grows has another shape, and everything is recompiled for it: many seconds in which
-a robot stands still. While there is room yet, the programs of `observe` and `decide` are compiled
-in a thread, by running both on a copy of the map in a larger table; the copy is thrown away.
+A grown table has another shape, for which everything is recompiled: many seconds in which a robot
+stands still. Before that, a thread compiles `observe` and `decide` by running both on a copy of the
+map in a larger table, which is then discarded.
 """
 
 import threading
@@ -15,20 +15,20 @@ from r3jax.mapping.join import grow
 from r3jax.planning.planner import Planner, decide, take_in
 
 _FROM = 0.1
-"""Share of the rows in use from which on the next size is prepared; at 0.7 the table grows. Early:
-half a minute of compiling beside the mapping is soon over, and a small room never comes to it."""
+"""Share of used rows at which the next size is prepared; the table grows at 0.7. Early enough for
+half a minute of compiling beside the mapping, but small rooms never reach it."""
 
 
 class GrowthAhead:
     """Prepares each size of a map once."""
 
     def __init__(self) -> None:
-        """Has prepared nothing."""
+        """Starts with nothing prepared."""
         self._prepared = 0
         self._thread: threading.Thread | None = None
 
     def look(self, planner: Planner, frame: Frame) -> None:
-        """Begins to prepare the next size if the map has come that far. Returns at once.
+        """Starts to prepare the next size if the map is full enough. Returns immediately.
 
         Args:
             planner: after a frame.
@@ -45,7 +45,7 @@ class GrowthAhead:
         self._thread.start()
 
     def wait(self) -> None:
-        """Waits until all that was begun is prepared."""
+        """Waits for all preparations to end."""
         if self._thread is not None:
             self._thread.join()
 

@@ -1,7 +1,7 @@
-"""Lazy greedy (Minoux 1978): the best of many, of which only a few are evaluated again.
+"""Lazy greedy selection (Minoux 1978): finds the best candidate with few evaluations.
 
-Where a gain hardly ever grows by other choices, an old one is as good as an upper bound: only
-candidates whose old gain is above the best new one need to be evaluated again.
+If gains do not increase by other choices, an old gain is an upper bound: only candidates whose old
+gain exceeds the best new one are evaluated again.
 """
 
 from collections.abc import Callable
@@ -19,15 +19,15 @@ def renew_best(
     """Evaluates candidates in the order of their bounds until the best is up to date.
 
     Args:
-        bound: gains as far as they are known, [C]; -inf for those that may not be chosen, inf for
-            those never evaluated. Changed in place.
-        is_new: True where the bound is the gain as it is now, [C]. Changed in place.
+        bound: latest known gains, [C]; -inf for forbidden candidates, inf for those never
+            evaluated. Changed in place.
+        is_new: True where the bound is the current gain, [C]. Changed in place.
         renew: computes the gains of some candidates [k], [k].
-        at_once: candidates that are evaluated together.
-        least: smaller gains are none.
+        at_once: number of candidates to evaluate together.
+        least: smaller gains do not count.
 
     Returns:
-        The best one, the first of several; None where none may be chosen or gains enough.
+        The best candidate, the first one on ties; None if none is allowed and gains enough.
     """
     while True:
         best = int(np.argmax(bound)) if len(bound) else None

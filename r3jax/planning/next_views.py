@@ -1,10 +1,9 @@
-"""Several next views at once, each chosen as if those before it had been taken.
+"""Chooses several next views at once, each as if those before it had been taken.
 
-The utility of a view never rises by another view: what that one shows renders no worse, and its
-unexplored cells are found (`scoring.simulated`). So the value of a set of views, the sum of what
-each adds when it is taken, is the same kind of sum that greedy choice is good for, and an old score
-is a bound on the new one: only the candidates whose bound is the greatest are scored again
-(lazy greedy, Minoux 1978). The views chosen are those of scoring all of them every time.
+Taking a view never increases the utility of another one: voxels in it do not become worse, and its
+unexplored cells are explored (`scoring.simulated`). So an old score is an upper bound of the new
+one, and only the candidates with the greatest bounds are scored again (lazy greedy, Minoux 1978).
+The result is the same as with scoring all candidates each time.
 
 Shape symbols: C candidates; k views.
 """
@@ -33,7 +32,7 @@ from r3jax.scoring.gather import gather_in_range
 from r3jax.scoring.simulated import simulate_view_near
 
 _AT_ONCE = 8
-"""Bounds that are renewed together: two shapes of candidates compile, C and this."""
+"""Number of candidates scored together: programs are compiled for C and for this number."""
 
 
 class NextViews(eqx.Module):
@@ -47,8 +46,8 @@ class NextViews(eqx.Module):
 
 
 ScoreIndices = Callable[[MapState, Cells, np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Maps voxels, cells and indices of candidates [k] to their poses [k, 4, 4], turned where they may
-turn, and their utilities [k]."""
+"""Maps voxels, cells and indices of candidates [k] to their poses [k, 4, 4], turned if directions
+are free, and their utilities [k]."""
 
 
 @checked(state=a_map, grid=a_grid, camera=a_camera)
@@ -63,17 +62,17 @@ def next_views(
 ) -> NextViews:
     """Finds the k most useful views, each given those before it. Not to be called under jit.
 
-    For one camera that will take them all, for several that take one each, for a person with a
-    list. The path between them is not counted: a robot's next view is a policy's `decide`.
+    For one camera that takes all of them, several cameras that take one each, or a person with a
+    list. Paths are not counted; for a robot's next view use `decide`.
 
     Args:
         state: the map.
         grid: the coarse grid; its free space is where views may be taken.
-        camera: that will take them.
-        k: how many.
-        poses: what to choose from, [C, 4, 4], each at most once. By default `config.num_candidates`
-            positions, spread over all known free space that keeps the safety margin; each looks
-            where its panorama is utilities most.
+        camera: the camera of the views.
+        k: number of views.
+        poses: candidates, [C, 4, 4], each chosen at most once. By default `config.num_candidates`
+            positions, spread over all known free space with the safety margin; each in the
+            direction of the highest utility in its panorama.
         config: candidates, safety margin, and `scoring`: lambda1 and the range.
 
     Raises:
@@ -87,9 +86,9 @@ def next_views(
         raise InputError(f"k must be at least 1, got {k}")
     checked = None if poses is None else _checked(poses, k)
     positions = _positions_in(grid, safe, config) if checked is None else checked[:, :3, 3]
-    # Without any safe cell nothing can be reached, and the mask would leave nothing to see.
+    # Without a safe cell nothing is reachable, and the mask would leave no unexplored cells.
     known_grid = mask_unexplorable(grid, safe) if safe.any() else grid
-    # Gathered once: views that are taken change what is known, not what is in range.
+    # Gathered once: taking views changes the statistics, not what is in range.
     places = jnp.asarray(positions, dtype=jnp.float32)
     voxels, cells, _ = gather_in_range(state, known_grid, places, config.scoring)
     if checked is None:
@@ -103,11 +102,11 @@ def next_views(
 
 
 def _positions_in(grid: OccupancyGrid, safe: np.ndarray, config: PlannerConfig) -> np.ndarray:
-    """Spreads positions [C, 3] float64 [m] over the cells that keep the margin."""
+    """Spreads positions [C, 3] float64 [m] over the cells with the safety margin."""
     cells = np.argwhere(safe)
     if len(cells) == 0:
         raise InputError(
-            "the grid knows no free cell that keeps the safety margin of "
+            "the grid has no free cell with the safety margin of "
             f"{config.safety_margin} m: integrate a frame with depth, or give poses"
         )
     centers = centers_on_host(grid, cells)
@@ -120,8 +119,8 @@ def _checked(poses: ArrayLike, k: int) -> np.ndarray:
     if checked.ndim != 3 or checked.shape[1:] != (4, 4):
         raise InputError(f"poses must have shape [C, 4, 4], got {checked.shape}")
     if len(checked) < k:
-        raise InputError(f"{k} views cannot be chosen from {len(checked)} poses, each at most once")
-    # A pose that is not rigid would be scored, too, and the number would mean nothing.
+        raise InputError(f"cannot choose {k} views from {len(checked)} poses, each at most once")
+    # A pose that is not rigid would get a meaningless score.
     for i, pose in enumerate(checked):
         if (error := rigid_error(pose)) is not None:
             raise InputError(f"pose {i}: {error}")
@@ -142,7 +141,7 @@ def _score_turned(
 ) -> tuple[ScoreIndices, tuple[np.ndarray, np.ndarray]]:
     start, scoring = (voxels, cells), config.scoring
     places = jnp.asarray(positions, dtype=jnp.float32)
-    # Kept: taking a view moves no surface, so that each position goes on seeing the same.
+    # Cached: taking a view moves no surface, so that visibility stays the same.
     panorama, kept = cache_positions_near(*start, camera, places, scoring)
 
     def score(voxels: MapState, cells: Cells, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -180,7 +179,6 @@ def _lazy_greedy(
     while True:
         best = renew_best(bound, is_new, renew, _AT_ONCE)
         assert best is not None  # there are at least k candidates
-        # A copy: the row is turned again when its bound is renewed.
         taken.append(poses[best].copy())
         utilities.append(float(bound[best]))
         if len(taken) == k:
@@ -188,7 +186,7 @@ def _lazy_greedy(
         left[best] -= 1
         if not left[best]:
             bound[best] = -np.inf
-        # A view was taken: every other score is a bound from here on.
+        # A view was taken: all other scores are now bounds.
         is_new[:] = False
         T = jnp.asarray(poses[best], dtype=jnp.float32)
         voxels, cells = simulate_view_near(voxels, cells, camera, T, config.scoring)

@@ -1,11 +1,11 @@
-"""The three verbs of a plug-in: start a planner, let it observe frames, let it decide.
+"""The three verbs for robots and SLAM systems: `start` a planner, `observe` frames, `decide`.
 
     planner = r3jax.start(camera, bounds, "r3-pano")
     planner = r3jax.observe(planner, frame)
     decision, planner, info = r3jax.decide(planner, frame.T_world_camera, key)
 
-`explore` is the loop over these three with a simulator, a clock, a budget and a record. A planner
-is immutable: the one before a call is still what it was.
+`explore` is the loop over them, with a simulator, a clock, a budget and a record. Planners are
+immutable: each call returns a new one.
 """
 
 from collections.abc import Iterable, Sequence
@@ -52,25 +52,25 @@ _mark_free_ball = jax.jit(mark_free_ball)
 
 
 class Planner(eqx.Module):
-    """What is known, and what the policy remembers; `start` makes one."""
+    """A planner: map, grid, policy and the policy's memory. Made by `start`."""
 
     map_state: MapState
-    """What was seen, from where and how consistently."""
+    """The voxel map."""
 
     grid: OccupancyGrid
     """Free, occupied and unexplored space."""
 
     policy_state: Any
-    """What the policy remembers: a pytree of its own."""
+    """The policy's memory, a pytree."""
 
     policy: Policy = eqx.field(static=True)
-    """Chooses the next view."""
+    """The policy that chooses the next view."""
 
     config: MappingConfig = eqx.field(static=True)
-    """How frames join the map and the grid."""
+    """Settings of the map and the grid."""
 
     reference: Reference | None = None
-    """An early frame, kept until the poses of the later ones have been found to fit the depth."""
+    """An early frame, kept until the poses of later frames agree with its depth."""
 
 
 a_planner = one(Planner, "r3jax.start makes one")
@@ -86,28 +86,28 @@ def start(
     config: MappingConfig | None = None,
     key: Array | None = None,
 ) -> Planner:
-    """Starts a planner that has seen nothing.
+    """Starts a planner with an empty map.
 
-    The first one on a machine also starts a process that compiles the kernels for CPUs.
+    The first one on a machine also starts a process that compiles the CPU kernels.
 
     Args:
-        camera: of the frames to come.
+        camera: of the frames.
         bounds: box of the space to explore: lower and upper corner, [2, 3] [m].
-        policy: an object, or its name in `r3jax policies`.
-        starts: poses [4, 4] where cameras begin: the ball of `config.start_radius` round each is
-            free, which no depth image shows from inside. Without one the robot may find itself
-            shut in until it has seen more.
-        config: voxels, cells, the sensor's range.
-        key: of the policy's first state; None: `jax.random.key(0)`.
+        policy: a policy, or its name (`r3jax policies` lists them).
+        starts: initial poses [4, 4] of the cameras. The ball of `config.start_radius` around each
+            counts as free, because no depth image shows it. Without a start the robot may be shut
+            in at first.
+        config: sizes of voxels and cells, range of the sensor.
+        key: random key for the policy's initial memory; None: `jax.random.key(0)`.
 
     Raises:
-        ValueError: no box, too many cells, a policy that is not known.
+        ValueError: an invalid box, too many cells, an unknown policy.
     """
     if is_cpu_only():
         compile_ahead()
     config = MappingConfig() if config is None else config
     policy = make_policy(policy) if isinstance(policy, str) else policy
-    # A fixed default: a plug-in without a seed still decides the same way twice.
+    # A fixed default, so that decisions are repeatable without a seed.
     key = jax.random.key(0) if key is None else key
     grid = first_grid(np.asarray(bounds, dtype=np.float64), starts, config)
     map_state = first_map(config)
@@ -116,11 +116,10 @@ def start(
 
 @checked(planner=a_planner, frame=a_frame)
 def observe(planner: Planner, frame: Frame) -> Planner:
-    """Adds a frame to the map and to the grid, and tells the policy.
+    """Adds a frame to the map and the grid, and passes it to the policy.
 
-    Not to be called under jit: the table of the map grows by itself. Warns where the poses of the
-    first frames contradict their depth: they are then of another convention, or not rigid motions
-    of one camera at all.
+    Not to be called under jit: the map's table grows when needed. Warns if the poses of the first
+    frames contradict their depth, for example because of another pose convention.
 
     Args:
         planner: before the frame.
@@ -131,7 +130,7 @@ def observe(planner: Planner, frame: Frame) -> Planner:
 
 
 def take_in(planner: Planner, frame: Frame) -> Planner:
-    """Adds a frame as `observe` does, without a check of its pose: that of a simulator is right."""
+    """Adds a frame as `observe` does, without checking its pose, for simulators."""
     map_state, grid = add_frame(planner.map_state, planner.grid, frame, planner.config)
     return tell_policy(replace(planner, map_state=map_state, grid=grid), frame)
 
@@ -140,16 +139,16 @@ def take_in(planner: Planner, frame: Frame) -> Planner:
 def decide(
     planner: Planner, T_world_camera: ArrayLike, key: Array
 ) -> tuple[Decision | None, Planner, PlanInfo]:
-    """Decides where to look next.
+    """Chooses the next view and the path to it.
 
     Args:
         planner: what is known.
         T_world_camera: where the camera is, [4, 4].
-        key: randomness of this decision; a new one for each.
+        key: random key; a new one for each decision.
 
     Returns:
-        The decision, or None if there is no view to take; the planner, which remembers it; and what
-        happened, with the reason in `outcome`.
+        The decision, or None if there is no view to take; the planner with its updated memory; and
+        information on the decision, with the reason in `outcome`.
 
     Raises:
         ValueError: a camera more than 32 km from the origin.
@@ -171,14 +170,14 @@ def observe_points(
     *,
     max_range: float | None = None,
 ) -> Planner:
-    """Adds a scan of a LiDAR to the grid: free and occupied space, no surface to be scored.
+    """Adds a LiDAR scan to the grid: free and occupied space, but no voxels to score.
 
     Args:
         planner: before the scan.
-        points: where rays ended, world, [n, 3] [m]. Rows that are not finite are left out; a point
-            beyond `max_range` says that its ray is free up to there.
-        sensor_positions: where they began, [3] or [n, 3] [m].
-        max_range: of the sensor [m]; None: that of the depth camera.
+        points: end points of the rays, world, [n, 3] [m]. Rows that are not finite are ignored; if
+            a point is beyond `max_range`, its ray is free up to there.
+        sensor_positions: origins of the rays, [3] or [n, 3] [m].
+        max_range: range of the LiDAR [m]; None: that of the depth camera.
 
     Raises:
         ValueError: other shapes, or no positive range.
@@ -203,17 +202,17 @@ def observe_points(
 
 @checked(planner=a_planner)
 def keep_out(planner: Planner, zones: Iterable[Any] | np.ndarray) -> Planner:
-    """Closes zones to the robot, in place of those of an earlier call; none: opens all of them.
+    """Sets the keep-out zones, replacing those of earlier calls; an empty list removes all.
 
-    No part of a footprint enters them; of a flying camera the middle does not.
+    No part of a footprint enters them; for a flying camera, its center does not.
 
     Args:
         planner: before.
-        zones: polygons, each [k, 2] corners in the world [m], k >= 3; or a mask of the grid's
+        zones: polygons, each with corners [k, 2] in the world [m], k >= 3; or a mask of the grid's
             columns, [X, Y] bool.
 
     Raises:
-        ValueError: no polygon, or a mask of another shape.
+        ValueError: not a polygon, or a mask of another shape.
     """
     shape = planner.grid.log_odds.shape
     if isinstance(zones, np.ndarray) and zones.dtype == bool:
@@ -243,7 +242,7 @@ def with_costmap(
     *,
     lethal: int = 100,
 ) -> Planner:
-    """Closes what a costmap says is occupied, in place of an earlier one.
+    """Closes the occupied pixels of a costmap, replacing an earlier costmap.
 
     Args:
         planner: before.
@@ -251,11 +250,12 @@ def with_costmap(
             to 100.
         resolution: side of a pixel [m].
         origin: x and y of the lower corner of pixel (0, 0), world [m]; without rotation.
-        lethal: from this value on a pixel is closed. Nav2 publishes 100 for obstacles and 99 for
-            where the robot's middle would touch them: with a footprint that is found here anyway.
+        lethal: pixels of this value or more are closed. Nav2 publishes 100 for obstacles and 99
+            where the robot's center would touch them, which r3jax computes itself from the
+            footprint.
 
     Raises:
-        ValueError: another shape, or no positive resolution.
+        ValueError: another shape, or a resolution that is not positive.
     """
     costs, corner = np.asarray(data), np.asarray(origin, np.float64)[:2]
     if costs.ndim != 2:
@@ -266,7 +266,7 @@ def with_costmap(
     if not 0.0 < resolution < np.inf:
         raise InputError(f"resolution must be positive [m], got {resolution}")
     y, x = np.nonzero(costs >= lethal)
-    # Both edges of a pixel: one that reaches into a cell closes it.
+    # Both edges of a pixel: every cell that it overlaps is closed.
     columns = np.zeros(planner.grid.log_odds.shape[:2], bool)
     size, low = float(planner.grid.cell_size), np.asarray(planner.grid.origin, np.float64)[:2]
     for dx, dy in ((0.01, 0.01), (0.01, 0.99), (0.99, 0.01), (0.99, 0.99)):
@@ -280,14 +280,14 @@ def with_costmap(
 
 @checked(planner=a_planner)
 def refuse(planner: Planner, decision: Decision, radius: float = 0.5) -> Planner:
-    """Notes a goal that the robot could not reach: no goal near it is chosen again.
+    """Records a goal that the robot could not reach, so that no goal near it is chosen again.
 
     Paths may still lead past it.
 
     Args:
-        planner: that decided on it, or a later one.
-        decision: what could not be done.
-        radius: how near is near [m].
+        planner: the planner that made the decision, or a later one.
+        decision: the decision with that goal.
+        radius: radius around the goal [m].
     """
     goal = jnp.asarray(decision.T_world_camera[:3, 3], jnp.float32)
     near = np.asarray(squared_distance(planner.grid, goal)) <= radius**2
@@ -299,13 +299,13 @@ def refuse(planner: Planner, decision: Decision, radius: float = 0.5) -> Planner
 def columns_in(grid: OccupancyGrid, corners: np.ndarray) -> np.ndarray:
     """Finds the columns of cells that a polygon [k, 2] [m] overlaps, [X, Y] bool."""
     size, origin = float(grid.cell_size), np.asarray(grid.origin, np.float64)
-    num = 4  # a zone thinner than a quarter of a cell may slip between these points
+    num = 4  # zones thinner than a quarter of a cell may be missed
     x, y = (
         origin[i] + size / num * (np.arange(num * grid.log_odds.shape[i]) + 0.5) for i in range(2)
     )
     inside = np.zeros((len(x), len(y)), bool)
     for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        if ay != by:  # the even-odd rule: each edge to the right of a point turns it over
+        if ay != by:  # the even-odd rule: each edge to the right of a point flips its state
             crosses = (ay > y) != (by > y)
             inside ^= crosses & (x[:, None] < ax + (y - ay) * (bx - ax) / (by - ay))
     return np.asarray(inside.reshape(len(x) // num, num, len(y) // num, num).any(axis=(1, 3)))
@@ -314,18 +314,18 @@ def columns_in(grid: OccupancyGrid, corners: np.ndarray) -> np.ndarray:
 def decide_ahead(
     planner: Planner, camera: Camera, T_next: np.ndarray, key: Array, scoring: ScoringConfig
 ) -> tuple[Decision | None, Planner, PlanInfo]:
-    """Decides on the view after the next one, on the map as that one is expected to leave it.
+    """Decides on the view after the next one, on the map predicted for after the next view.
 
     Args:
-        planner: what is known while the camera is on its way.
-        camera: of the view that it is on its way to.
-        T_next: pose of that view, [4, 4].
+        planner: the planner while the camera moves.
+        camera: of the next view.
+        T_next: pose of the next view, [4, 4].
         key: randomness of this decision.
         scoring: range and size of the depth buffer of the imagined view.
 
     Returns:
-        As `decide`; None also for a policy that cannot `reconsider`. Of the policy's memory only
-        what drawing and choosing noted: the path has not been flown, and nothing was looked at.
+        As `decide`; None also for a policy without `reconsider`. The policy's memory is only
+        updated by drawing and choosing, not by the path or the view, which have not been taken.
     """
     if not isinstance(planner.policy, PlansAhead):
         return None, planner, PlanInfo(DecisionOutcome.NO_CANDIDATE)
@@ -342,12 +342,12 @@ def decide_ahead(
 def reconsider(
     planner: Planner, T_world_camera: np.ndarray, planned: Decision, key: Array
 ) -> tuple[Decision | None, Planner, PlanInfo]:
-    """Decides again among the best candidates of `decide_ahead`, on what has come in since.
+    """Decides again among the best candidates of `decide_ahead`, on the current map.
 
     Args:
-        planner: what is known now.
-        T_world_camera: where the camera has arrived, [4, 4].
-        planned: what `decide_ahead` decided.
+        planner: the current planner.
+        T_world_camera: pose where the camera has arrived, [4, 4].
+        planned: the result of `decide_ahead`.
         key: randomness of this decision.
 
     Returns:
@@ -362,7 +362,7 @@ def reconsider(
 
 
 def tell_policy(planner: Planner, frame: Frame) -> Planner:
-    """Tells the policy of a frame that is in the map already."""
+    """Passes a frame that is in the map already to the policy."""
     state = planner.policy.observe(planner.policy_state, planner.map_state, frame)
     return replace(planner, policy_state=state)
 
@@ -404,7 +404,7 @@ def mark_starts(
     grid: OccupancyGrid, starts: Iterable[ArrayLike], config: MappingConfig
 ) -> OccupancyGrid:
     """Marks the ball round each start as free."""
-    # No image shows the ball round the start; without it the robot stands in the unknown.
+    # No image shows the ball around the start; without it the robot is in unknown space.
     for pose in starts:
         position = jnp.asarray(np.asarray(pose)[:3, 3], dtype=jnp.float32)
         grid = _mark_free_ball(grid, position, config.start_radius)
@@ -422,7 +422,7 @@ def add_frame(
         allow_growth=config.allow_growth,
         drop_edges=config.drop_edges,
     )
-    # Depth before the body: a hit measured in this frame must not be vouched away.
+    # Depth before the body: free space of the body must not override hits of this frame.
     grid = _integrate_depth(grid, frame, config.max_range)
     position = np.asarray(frame.T_world_camera)[:3, 3]
     return map_state, _mark_free_ball(grid, position, config.body_radius)

@@ -1,4 +1,4 @@
-"""The plug point of the loop: what a policy is asked, and what it answers. Types only."""
+"""The interface of policies: what they get and what they return. Types only."""
 
 import enum
 from dataclasses import dataclass, field
@@ -16,34 +16,37 @@ from r3jax.planning.robot.travel import Travel
 
 
 class PolicyError(RuntimeError):
-    """A policy that cannot decide, and why: the run ends, what was recorded stays."""
+    """A policy cannot decide, for this reason: the run ends, and its record stays."""
 
 
 class DecisionOutcome(enum.Enum):
-    """How a decision ended. Anything but MOVED ends the run, with the reason in the trace."""
+    """The outcome of a decision.
+
+    Any other than MOVED ends the run, with the reason in the trace.
+    """
 
     MOVED = "moved"
     """A candidate was chosen."""
 
     NO_CANDIDATE = "no-candidate"
-    """No candidate could be drawn: no free cell in reach."""
+    """No candidate could be drawn: no free cell within the radius."""
 
     NO_REACHABLE_CANDIDATE = "no-reachable-candidate"
     """Candidates were drawn, but no safe path leads to any of them."""
 
     SHUT_IN = "shut-in"
-    """The latest goals all lay within a step of each other, and no path leads farther."""
+    """The latest goals are all within a step of each other, and no path leads farther."""
 
 
 @dataclass(frozen=True)
 class Decision:
-    """Where to go next, how, and what else was on offer. On the host: NumPy."""
+    """The next view, the path to it, and the other candidates. On the host: NumPy."""
 
     T_world_camera: np.ndarray
     """The chosen pose, [4, 4] float64."""
 
     waypoints: np.ndarray
-    """Path of the camera center [m], [K, 3]; first the present position, last the chosen one."""
+    """Path of the camera center [m], [K, 3], from the present position to the chosen one."""
 
     length: float
     """Length of that path [m]."""
@@ -55,17 +58,17 @@ class Decision:
     """Every pose that was scored, [C, 4, 4]."""
 
     utilities: dict[str, np.ndarray] = field(default_factory=dict[str, np.ndarray])
-    """Per candidate, [C] each: always `total`, and `path` [m], what turning costs included;
-    `utility` where views were scored, and its parts `exploration` and `rendering` where they were
-    told apart."""
+    """Scores per candidate, [C] each: always `total` and `path` [m] (including the cost of
+    turning); `utility` if views were scored, and its parts `exploration` and `rendering` if
+    computed separately."""
 
     seconds: float | None = None
-    """Time for the path and the turn [s]; None: the length over the loop's speed."""
+    """Time for the path and the turn [s]; None: the length divided by the loop's speed."""
 
 
 @dataclass(frozen=True)
 class PlanInfo:
-    """What happened while deciding."""
+    """Information on a decision."""
 
     outcome: DecisionOutcome
     num_candidates: int = 0
@@ -74,49 +77,47 @@ class PlanInfo:
     """Wall time per part of the decision (`candidates`, `travel`, `scoring`) [s]."""
 
     reason: str = ""
-    """Why there is no decision, and what to do; empty where there is one."""
+    """Why there is no decision, and what to do; empty if there is one."""
 
     limited_by: dict[str, int] = field(default_factory=dict[str, int])
-    """Where there is no decision: how many cells near the robot each limit closes."""
+    """If there is no decision: numbers of cells near the robot closed by each limit."""
 
     expected_gain: float | None = None
-    """What the chosen view is expected to add, in the policy's own measure (of R3: the utility U
-    before paths are weighed); None without a decision, and where a policy has no such measure."""
+    """Expected gain of the chosen view in the policy's own measure (R3: the utility U, before paths
+    are weighed); None without a decision or without such a measure."""
 
 
 @dataclass(frozen=True)
 class Situation:
-    """All that a decision may depend on: what is known, where the robot is and can go."""
+    """Everything that a decision may depend on: map, grid, pose and reachable space."""
 
     map_state: MapState
 
     grid: OccupancyGrid
-    """Grid as it is; for travel."""
+    """The grid, for travel."""
 
     scoring_grid: OccupancyGrid
-    """The same with a mask of the cells that count (`look_round`); for
-    utilities."""
+    """The grid with a mask of the cells that may be unexplored (`look_round`), for utilities."""
 
     travel: Travel
-    """Where the robot can go from here."""
+    """Reachable space."""
 
     camera: Camera
-    """Camera of every frame to come."""
+    """The camera."""
 
     memory: Any
-    """What the policy keeps beside the map."""
+    """The policy's own memory."""
 
     limits: Limits = field(default_factory=Limits)
-    """What the robot may do next. Candidates need not lie within them: `decide`
-    sees to that."""
+    """Limits of the robot's next view. Candidates may violate them: `decide` projects them."""
 
     notes: Any = None
-    """What `draw` noted of the candidates."""
+    """Notes of `draw` on the candidates."""
 
 
 @runtime_checkable
 class Policy(Protocol):
-    """Chooses the next view. Pure: what it remembers travels in `state`."""
+    """Chooses the next view. Pure: its memory is passed as `state`."""
 
     name: str
 
@@ -125,7 +126,7 @@ class Policy(Protocol):
         ...
 
     def observe(self, state: Any, map_state: MapState, frame: Frame) -> Any:
-        """Takes note of a frame that has just been integrated into the map."""
+        """Returns the state after a frame, which is already in the map."""
         ...
 
     def decide(
@@ -148,12 +149,12 @@ class Policy(Protocol):
         T_world_camera: np.ndarray,
         waypoints: np.ndarray,
     ) -> Any:
-        """Notes a path that another policy chose, before the robot follows it (forked runs).
+        """Returns the state after a path that another policy chose (forked runs).
 
         Args:
-            state: what the policy remembers.
-            map_state: the map, the latest view included.
-            grid: the grid, the same.
+            state: the policy's memory.
+            map_state: the map, including the latest view.
+            grid: the grid, including the latest view.
             T_world_camera: where the latest view was taken.
             waypoints: the path to the next one, [K, 3] [m].
         """
@@ -174,7 +175,7 @@ class PlansAhead(Policy, Protocol):
         *,
         key: Array,
     ) -> tuple[Decision | None, Any, PlanInfo]:
-        """Decides again among the best candidates of a decision, on what has come in since.
+        """Decides again among the best candidates of a decision, on the current map.
 
         The decision is None if no path leads to any of them: the policy must decide again.
         """
@@ -183,9 +184,9 @@ class PlansAhead(Policy, Protocol):
 
 @runtime_checkable
 class LivesOutside(Policy, Protocol):
-    """A policy whose memory is in a program of its own: it cannot be stored, and must be ended.
+    """A policy whose memory is in an external program: it cannot be stored, and must be closed.
 
-    Resuming a run of it shows the program all frames from the first view on, and decides again.
+    Resuming its run sends all frames from the first view on to the program, and decides again.
     """
 
     def close(self) -> None:

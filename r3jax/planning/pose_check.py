@@ -1,11 +1,11 @@
-"""Tests whether the poses of the first frames fit their depth: a wrong convention is noticed early.
+"""Tests whether the poses of the first frames agree with their depth, to detect wrong conventions.
 
-A world-to-camera matrix and a pose in OpenGL axes are rigid, so one frame does not give them away.
-Between two frames each convention implies another motion of the camera. The points of each frame
-are projected into the other by that motion: a point in front of the surface that is measured there
-lies in space that was seen through. The motion that leaves no such points names the convention.
-
-On the host in NumPy, about two milliseconds a frame, until one pair of frames settles the question.
+A world-to-camera matrix and a pose in OpenGL axes are rigid, too, so that a single frame does not
+show the mistake. Between two frames, each convention implies a different motion of the camera. The
+points of each frame are projected into the other by that motion: a point in front of the surface
+measured there contradicts it, because the other frame saw through that space. The convention
+without such points is the right one. On the host in NumPy, about 2 ms per frame, until one pair of
+frames is conclusive.
 
 Shape symbols: h w pixels of a subsampled depth image; n points.
 """
@@ -21,32 +21,33 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from r3jax.frame import CONVENTIONS, Frame, to_camera_to_world
 
 _SIDE = 64
-"""Columns of a subsampled depth image, about."""
+"""Approximate number of columns of a subsampled depth image."""
 
 _TOLERANCE = 0.05
 """Depths agree up to this [m], and up to this share of the depth."""
 
 _MIN_OVERLAP = 0.15
-"""Share of the points that must lie where the other frame measures, or nothing is concluded."""
+"""Minimum share of points with a measurement in the other frame for a conclusion."""
 
 _MIN_POINTS = 200
-"""Points that a frame must measure, or nothing is concluded."""
+"""Minimum number of measured points of a frame for a conclusion."""
 
 _MAX_CONTRADICTED = 0.4
-"""From this share of contradicted points on, two frames do not fit."""
+"""Two frames disagree from this share of contradicted points on."""
 
 _MAX_OF_FITTING = 0.25
-"""Up to this share of contradicted points, another convention fits."""
+"""Another convention fits up to this share of contradicted points."""
 
 _SUSPECTED = 3
-"""Pairs in a row after which another convention is named: walls of two rooms may fit by chance."""
+"""Pairs in a row before another convention is suggested: walls of two rooms may fit by chance."""
 
 _MAX_FRAMES = 200
-"""Frames after which the question is dropped: a camera that hardly moves settles nothing."""
+"""Number of frames after which the test is given up: a camera that hardly moves is never
+conclusive."""
 
 
 class Reference(eqx.Module):
-    """An earlier frame, subsampled, which the next ones are compared with."""
+    """An earlier frame, subsampled, for comparison with the next ones."""
 
     depth: np.ndarray
     """z-depth, 0 where it is not known, [h, w] float32 [m]."""
@@ -58,16 +59,16 @@ class Reference(eqx.Module):
     """fx, fy, cx, cy of the subsampled image, whose pixel centers are whole numbers [px]."""
 
     num_compared: int = 0
-    """Frames that were compared so far."""
+    """Number of frames compared so far."""
 
     suspect: str = ""
-    """Another convention, by which frames overlapped that do not as given."""
+    """Another convention with which frames overlap that do not overlap as given."""
 
     num_suspected: int = 0
-    """Pairs in a row that suggest `suspect`."""
+    """Number of pairs in a row that suggest `suspect`."""
 
     is_settled: bool = False
-    """True: there is nothing left to compare."""
+    """True once the test is finished."""
 
 
 def check_poses(reference: Reference | None, frame: Frame) -> Reference:
@@ -75,7 +76,7 @@ def check_poses(reference: Reference | None, frame: Frame) -> Reference:
 
     Args:
         reference: the earlier frame; None: this is the first one.
-        frame: the frame that is observed.
+        frame: the observed frame.
 
     Returns:
         The reference for the next frame.
@@ -98,8 +99,9 @@ def check_poses(reference: Reference | None, frame: Frame) -> Reference:
         )
         return replace(reference, is_settled=True)
     if math.isnan(given):
-        # As given, the frames do not overlap. That they do otherwise may be chance, but not often;
-        # "ros" makes a roll of a look aside, by which any two walls fit.
+        # The frames do not overlap as given. That they do with another convention may be chance,
+        # but not repeatedly; "ros" turns a sideways rotation into a roll, with which any two walls
+        # fit.
         if not fits or fitting == "ros":
             return replace(now, suspect=reference.suspect, num_suspected=reference.num_suspected)
         pairs = reference.num_suspected + 1 if fitting == reference.suspect else 1
@@ -107,7 +109,7 @@ def check_poses(reference: Reference | None, frame: Frame) -> Reference:
             _warn("frames overlap that should not", fitting, fits)
             return replace(now, is_settled=True)
         return replace(now, suspect=fitting, num_suspected=pairs)
-    # Settled once every other convention would have been noticed in the same pair.
+    # Finished once every other convention would have been detected in the same pair.
     if all(not share <= _MAX_CONTRADICTED for share in shares.values()):
         return replace(reference, is_settled=True)
     # The frames fit as given, so what suggested another convention was chance.
@@ -132,7 +134,7 @@ def reference_of(frame: Frame) -> Reference:
     depth, camera = np.asarray(frame.depth), frame.camera
     step = max(1, round(camera.width / _SIDE))
     depth = depth[step // 2 :: step, step // 2 :: step]
-    # inf says that nothing is near, but not how near: it takes no part.
+    # inf only means that nothing is near: such pixels are ignored.
     depth = np.where(np.isfinite(depth), depth, 0.0).astype(np.float32)
     lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float64)
     lens[2:] -= step // 2 + 0.5
@@ -145,11 +147,11 @@ def contradicted(first: Reference, second: Reference, convention: str) -> float:
     Args:
         first: a frame.
         second: another one.
-        convention: how their poses are read.
+        convention: the convention of their poses.
 
     Returns:
-        Of the points that lie where the other frame has a measurement, and not behind it; NaN
-        where there are too few of them.
+        Share of the points that lie where the other frame has a measurement, and not behind it; NaN
+        if there are too few of them.
     """
     A, B = (to_camera_to_world(one.T_world_camera, convention) for one in (first, second))
     T = np.linalg.inv(A) @ B
@@ -174,7 +176,7 @@ def _count(source: Reference, target: Reference, T: np.ndarray) -> tuple[int, in
     height, width = target.depth.shape
     is_in = is_ahead & (u >= 0) & (u < width) & (v >= 0) & (v < height)
     at = v[is_in].astype(int), u[is_in].astype(int)
-    # On a slope and at an edge the depth changes within a sample: its neighbors' depths count too.
+    # On slopes and edges the depth changes within a sample: neighboring depths count, too.
     is_known = target.depth > 0.0
     near = minimum_filter(np.where(is_known, target.depth, np.inf), 3)[at]
     far = maximum_filter(target.depth, 3)[at]

@@ -1,4 +1,4 @@
-"""Maps corrected key frames again, after a loop closure: what a voxel has seen cannot be moved."""
+"""Rebuilds the map from corrected key frames after a loop closure: voxels cannot be moved."""
 
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -28,11 +28,11 @@ def rebuild(
     starts: Iterable[ArrayLike] | None = None,
     key: Array | None = None,
 ) -> Planner:
-    """Returns a planner of the same settings that has observed these frames instead.
+    """Returns a planner with the same settings that has observed these frames instead.
 
-    As `start` and then `observe` of each frame, in a map as large as the present one: nothing is
-    compiled for another size in the middle. The planner that is given stays as it is and may go on
-    observing and deciding in another thread, until the new one takes its place:
+    As `start` and then `observe` of each frame, in a map as large as the present one: so that
+    nothing is recompiled. The given planner is unchanged; it can continue to observe and decide in
+    another thread until the new one replaces it:
 
         future = executor.submit(r3jax.rebuild, planner, corrected)
         ...
@@ -40,9 +40,9 @@ def rebuild(
             planner = future.result()
 
     Args:
-        planner: whose bounds, policy and settings stay.
-        frames: key frames with corrected poses, in order, at least one. They may be read from a
-            disk: of an iterator the next frame is read while one is mapped.
+        planner: its bounds, policy and settings are used.
+        frames: key frames with corrected poses, in order, at least one. May be an iterator that
+            reads them from disk: the next frame is read while one is mapped.
         starts: as in `start`; None: the place of the first frame.
         key: as in `start`.
 

@@ -1,9 +1,9 @@
-"""Refinement: the best few candidates climb the smooth utility, each within a box of free space.
+"""Refines the best candidates by gradient ascent of the smooth utility, in boxes of free space.
 
 From a view, `scoring.soft_utility` is ascended in position, azimuth and elevation by jaxopt's
-projected gradient. Where a climb ends becomes the nearest view that the robot may take. Then the
-exact utility decides: a view replaces its start only if it is better, both alone and net of the
-path. On the host; scores are jitted.
+projected gradient. Each end point is projected to the nearest view that the robot may take. A view
+replaces its start only if its exact utility is better, both with and without the path's cost. On
+the host; scores are jitted.
 
 Shape symbols: C candidates; K starts, always `config.refine`, so that climbing compiles once.
 """
@@ -37,13 +37,13 @@ with warnings.catch_warnings():
     import jaxopt
 
 _MAX_STEPS = 20
-"""Steps of a climb; most end before."""
+"""Maximum number of steps; most ascents converge earlier."""
 
 _TOLERANCE = 1e-2
-"""A climb ends where the gradient is smaller: shares of the start's utility per `_UNIT`."""
+"""Convergence: gradient as a share of the start's utility per `_UNIT`."""
 
 _UNIT = 0.3
-"""Steps of the same effect along the numbers of a view [m] or [rad]."""
+"""Scales of the parameters of a view [m] or [rad]."""
 
 
 def refine_best(
@@ -52,13 +52,13 @@ def refine_best(
     utilities: dict[str, np.ndarray],
     config: PlannerConfig,
 ) -> tuple[Candidates, dict[str, np.ndarray]]:
-    """Replaces the best few candidates by better views near them, where a climb finds any.
+    """Replaces the best candidates by better views near them, if gradient ascent finds any.
 
     Args:
-        situation: what is known.
+        situation: map, grid, pose and limits.
         candidates: within the robot's limits.
         utilities: [C] each; `utility`, that of `scoring.utility`, among them.
-        config: how many, how far.
+        config: number of candidates and maximum displacement.
 
     Returns:
         Candidates and utilities; of those replaced, utilities rise by what the exact utility gains
@@ -68,13 +68,13 @@ def refine_best(
         path_lengths(situation.travel, views), views.direction
     )
     utility, path = utilities["utility"], cost(candidates)
-    # The sums stay those of the candidates as drawn: a view that rises must not lower the others.
+    # Sums over the original candidates: a refined view must not lower the shares of others.
     weigh = functools.partial(net_utility, lambda2=config.lambda2, among=(utility, path))
     chosen = _best(candidates, weigh(utility, path), config.refine)
     if len(chosen) == 0:
         return candidates, utilities
     climbed, gains = _climbed(situation, candidates.take(chosen), config)
-    # The smooth utility only proposes: a view that is not exactly better is not taken.
+    # The smooth utility only proposes views; the exact one decides.
     is_better = gains["utility"] > 0.0
     net = weigh(utility[chosen] + gains["utility"], cost(climbed))
     is_better &= net > weigh(utility[chosen], path[chosen])
@@ -95,12 +95,12 @@ def _climbed(
     boxes = [
         free_box(situation.travel, position, config.refine_radius) for position in starts.position
     ]
-    # A box per start: convex, so that no step of a climb has to test for collisions.
+    # One box per start: convex, so that no step has to test for collisions.
     low, high = (np.stack(corners) for corners in zip(*boxes, strict=True))
     corners = jnp.asarray(np.concatenate([low, high]), dtype=jnp.float32)
     near = gather_in_range(situation.map_state, situation.scoring_grid, corners, scoring)[:2]
     origin = np.column_stack([starts.position, *angles_along(starts.direction)])
-    # The azimuth goes round in a circle: a bound on it would be a wall in one direction.
+    # The azimuth is periodic and has no bounds.
     ends = [(-np.inf, np.inf), np.radians(limits.motion.elevations)]
     lowest, highest = (
         np.column_stack([corner, *np.tile([end[i] for end in ends], (len(low), 1)).T])
@@ -109,9 +109,9 @@ def _climbed(
     poses = starts.poses_on_device()
     numbers = (jnp.asarray(x, dtype=jnp.float32) for x in (origin, lowest, highest))
     found = np.asarray(_climb(*near, camera, scoring, poses, *numbers), np.float64)
-    # float32 rounds: the box is kept to the last bit here, and the directions below.
+    # float32 rounds: positions are clipped to the box here, directions below.
     positions = np.clip(found[:, :3], low, high)
-    # A climb knows boxes and elevations, but not how far the robot may turn on the path.
+    # The ascent is bounded in position and elevation, but not by the robot's limits of turning.
     climbed = limits.project_to_feasible(
         Candidates(positions, directions_along(*found[:, 3:].T), starts.valid)
     )
@@ -150,7 +150,7 @@ def _climb(
     def climb(start: tuple[Array, Array, Array, Array]) -> Float[Array, " 5"]:
         pose, origin, lowest, highest = start
         utility = soft_utility_near(voxels, cells, camera, pose, config)
-        # Divided by the start, utilities of thousands and of tens meet one tolerance.
+        # Divided by the initial utility, so that one tolerance suits all scales.
         least = jnp.maximum(utility(pose), 1.0)
         solver = jaxopt.ProjectedGradient(
             lambda offset: -utility(pose_at(origin + _UNIT * offset)) / least,
@@ -165,41 +165,41 @@ def _climb(
         # Scaled back, the numbers may round past the box.
         return jnp.clip(origin + _UNIT * found, lowest, highest)
 
-    # One after the other: for some starts in an office, XLA's code for all at once never ended.
+    # One after the other: for some starts in the office, XLA's vectorized code did not terminate.
     return jax.lax.map(climb, (poses, origin, lowest, highest))
 
 
 def _best(candidates: Candidates, total: np.ndarray, num: int) -> np.ndarray:
-    """Selects the `num` best, no view twice while there are others.
+    """Selects the `num` best, without duplicates if there are enough views.
 
-    The result is empty if none can be reached.
-
-    A robot that cannot move draws its own place again and again.
+    The result is empty if none can be reached. A robot that cannot move draws its own position
+    repeatedly.
     """
     ranked = np.argsort(-total, kind="stable")
     ranked = ranked[np.isfinite(total[ranked]) & candidates.valid[ranked]]
     views = np.concatenate([candidates.position, candidates.direction], axis=1)[ranked]
-    # Climbing one view twice would waste a start.
+    # Refining one view twice would waste a start.
     _, first = np.unique(views, axis=0, return_index=True)
     distinct = ranked[np.sort(first)][:num]
-    # Repeats fill up the starts, so that climbing compiles once.
+    # Padded with repeats, so that the ascent compiles once.
     return distinct[np.arange(num) % len(distinct)] if len(distinct) else distinct
 
 
 def free_box(travel: Travel, position: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Finds a box round a place in which the robot may stop everywhere.
+    """Finds a box around a position in which the robot may stop everywhere.
 
-    The box of cells round the place's own grows, one layer at a time, over safe cells to which a
-    way leads, and ends where candidates do: a quarter of a cell from the middles of its outermost.
+    The box of cells around the position's own grows, layer by layer, over safe reachable cells. It
+    ends where candidates may be: a quarter of a cell from the centers of its outermost cells.
 
     Args:
-        travel: where the robot may stop.
-        position: where it may [3] [m].
+        travel: positions to stop at.
+
+        position: one of them, [3] [m].
         radius: the box ends at this distance along each axis [m].
 
     Returns:
-        The lowest and the highest corner [3] [m]; twice the position where its cell does not keep
-        the margin: what stands there has nowhere to go.
+        The lowest and the highest corner [3] [m]; both are the position itself if its cell does not
+        keep the margin.
     """
     # Not `goals`: those hold the robot's own cell even without the margin.
     stops = travel.safe & travel.reachable
@@ -210,7 +210,7 @@ def free_box(travel: Travel, position: np.ndarray, radius: float) -> tuple[np.nd
     highest = np.minimum(travel.cell_of(position + radius), np.array(stops.shape) - 1)
     first, last = np.array(cell), np.array(cell)
     grows = True
-    # Layer by layer in turn, so that no axis takes all the room before the others grow.
+    # Layer by layer in turn, so that the box grows along all axes.
     while grows:
         grows = False
         for axis, (end, step) in itertools.product(range(3), ((first, -1), (last, 1))):
@@ -225,5 +225,5 @@ def free_box(travel: Travel, position: np.ndarray, radius: float) -> tuple[np.nd
     low, high = travel.centers(first) - reach, travel.centers(last) + reach
     low, high = np.maximum(low, position - radius), np.minimum(high, position + radius)
     low[2], high[2] = np.clip((low[2], high[2]), *travel.heights)
-    # The start itself always lies in its box, jittered to the border or not.
+    # The box always contains the start, even if it was jittered to the border.
     return np.minimum(low, position), np.maximum(high, position)

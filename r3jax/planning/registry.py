@@ -1,4 +1,4 @@
-"""Finds policies by name, makes them, and takes in those of others."""
+"""Finds policies by name, makes them, and registers new ones."""
 
 import importlib
 import inspect
@@ -15,7 +15,7 @@ PolicyClass = TypeVar("PolicyClass", bound=type)
 
 
 def register_policy(policy_class: PolicyClass) -> PolicyClass:
-    """Makes a policy known by its `name` in this process; a decorator.
+    """Registers a policy by its `name` in this process; a decorator.
 
         @r3jax.register_policy
         @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def policy_names() -> tuple[str, ...]:
 
 
 def describe(name: str) -> str:
-    """Says what a policy does, in one line.
+    """Describes a policy in one line.
 
     Raises:
         ValueError: no policy has that name.
@@ -62,7 +62,7 @@ def source_of(name: str) -> str:
 
 
 def config_class(name: str) -> type[PlannerConfig]:
-    """Finds the settings of a policy: its class attribute `Config`, or what all policies share.
+    """Finds the settings class of a policy: its attribute `Config`, or `PlannerConfig`.
 
     Raises:
         ValueError: no policy has that name.
@@ -83,7 +83,7 @@ def make_policy(name: str, **settings: Any) -> Policy:
     if name.startswith(COMMAND):
         settings = settings | {"command": name.removeprefix(COMMAND)}
     config = config_class(name)
-    # Checked here: the error of the dataclass itself would not list the settings there are.
+    # Checked here: the dataclass' own error would not list the available settings.
     known = [field.name for field in fields(config)]
     unknown = [setting for setting in settings if setting not in known]
     if unknown:
@@ -99,11 +99,11 @@ def policy_class(name: str) -> Any:
     Raises:
         ValueError: no policy has that name, or its module has no such class.
     """
-    # This process first: who registers a class wants that one, not an installed one.
+    # Registered classes first: they override installed ones.
     if name in REGISTERED:
         return REGISTERED[name]
     module, _, kind = home_of(name).partition(":")
-    # Imported only now: names are listed without loading JAX.
+    # Lazy import: names are listed without loading JAX.
     try:
         found = getattr(importlib.import_module(module), kind)
     except (ImportError, AttributeError) as error:

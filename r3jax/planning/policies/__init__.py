@@ -1,4 +1,4 @@
-"""One file or folder per policy, and where each is found: names are known without importing them.
+"""The policies, one module each, and the table of their names, which needs no import of them.
 
 A policy comes from this package, from another one (entry-point group `r3jax.policies`), from a
 class given as `package.module:Class`, from this process (`planning.registry.register_policy`), or
@@ -15,7 +15,7 @@ from r3jax.planning.policies.foreign.commands import COMMAND, words_of
 from r3jax.validation.errors import did_you_mean
 
 GROUP = "r3jax.policies"
-"""Entry points by which other packages offer policies: `name = "package.module:Class"`."""
+"""Entry-point group for policies of other packages: `name = "package.module:Class"`."""
 
 HOMES = {
     name: f"r3jax.{home}"
@@ -41,7 +41,7 @@ ALIASES = {"ours": "r3", "ours-pano": "r3-pano", "ours-ahead": "r3-ahead"}
 """Former names of policies, in recorded runs, submissions and records."""
 
 FOREIGN = "r3jax.planning.policies.foreign.foreign:Foreign"
-"""Module and class of the policy that asks a program."""
+"""Module and class of the policy that runs a program."""
 
 RETIRED = {
     "ours-demand": "it lost 0.74 dB against r3-pano; commit e43d800 has it",
@@ -50,18 +50,18 @@ RETIRED = {
     ("active-gs-no-depth", "unseen", "unseen-depth", "uniform"),
     "no table rests on it; commit fb13156 has it",
 )
-"""Policies that have left the package: the reason, and where their code is."""
+"""Removed policies: why they were removed, and the commit with their code."""
 
 REGISTERED: dict[str, type] = {}
-"""Classes that `planning.registry.register_policy` was told of in this process."""
+"""Classes registered by `planning.registry.register_policy` in this process."""
 
 _CLASS = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 
 
 @functools.cache
 def plugins() -> dict[str, str]:
-    """Finds the module and class of every policy that an installed package offers."""
-    # Not loaded: listing names must not import the packages of others.
+    """Finds the module and class of every policy of installed packages."""
+    # Not loaded: listing names must not import other packages.
     return {point.name: point.value for point in entry_points(group=GROUP)}
 
 
@@ -80,11 +80,11 @@ def home_of(name: str) -> str:
     """Finds the `package.module:Class` of a policy that is not registered in this process.
 
     Raises:
-        ValueError: no policy has that name; names the known ones, and the one that was meant.
+        ValueError: an unknown name; lists the known ones and suggests a similar one.
     """
     if name.startswith(COMMAND):
         return FOREIGN
-    # Before all others: who asks for a policy that has left wants the reason, not a similar name.
+    # First of all: for a removed policy give the reason, not a similar name.
     if name in RETIRED:
         raise InputError(f"policy {name!r} has left the package: {RETIRED[name]}")
     # Before plug-ins: in recorded runs these names mean policies of this package.
@@ -103,11 +103,11 @@ def home_of(name: str) -> str:
 
 
 def check_policy(name: str) -> None:
-    """Refuses a name that no policy has, or whose package is not there; imports no policy.
+    """Refuses an unknown policy, or one whose package is not installed; imports no policy.
 
     Raises:
-        ValueError: names the known ones, and the one that was meant; or the program that is not
-            there.
+        ValueError: lists the known policies and suggests a similar one, or names the missing
+            program.
     """
     if name in REGISTERED:
         return
@@ -116,7 +116,7 @@ def check_policy(name: str) -> None:
         return
     module = home_of(name).partition(":")[0]
     try:
-        # This imports the parents of a module, and raises where one of them is missing.
+        # This imports the parents of a module, and raises if one of them is missing.
         found = importlib.util.find_spec(module)
     except ImportError:
         found = None

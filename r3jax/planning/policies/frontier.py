@@ -1,7 +1,7 @@
-"""The classical explorer: go to the nearest place from which the unknown begins, and look.
+"""Frontier exploration: goes to the nearest view of the boundary to unknown space.
 
-A frontier cell that was looked at once is left alone until all others were: some, before a
-window or behind a chair, never turn into known space.
+A frontier cell that was viewed once is not viewed again before all others: some, in front of a
+window or behind a chair, never become known.
 """
 
 from dataclasses import dataclass
@@ -29,15 +29,15 @@ from r3jax.planning.robot.limits import UNBOUND, Limits
 from r3jax.planning.robot.travel import Travel
 
 _MAX_TARGETS = 300
-"""Frontier cells that are considered per decision, drawn at random."""
+"""Maximum number of frontier cells per decision, drawn at random."""
 
 _STOPS_PER_TARGET = 4
-"""Places that are tried per frontier cell: the nearest by path among its neighbors."""
+"""Number of positions tried per frontier cell: the nearest by path among its neighbors."""
 
 _ATTEMPT_COSINE = 0.9
 _ATTEMPT_REACH = 3.0
-"""Frontier cells within 26 degrees of the line of sight and 3 m count as looked at too: they lie
-inside the image of any camera with 52 degrees or more."""
+"""Frontier cells within 26 degrees of the viewing direction and 3 m count as viewed, too: they are
+in the image of any camera with a field of view of 52 degrees or more."""
 
 
 @dataclass(frozen=True)
@@ -48,40 +48,39 @@ class Frontier(GreedyPolicy):
     source = "Yamauchi, CIRA 1997: the nearest frontier"
 
     def first_memory(self, camera: Camera, grid: OccupancyGrid) -> np.ndarray:
-        """Returns the frontier cells that were viewed on purpose, [X, Y, Z] bool: none."""
+        """Returns the frontier cells viewed so far, [X, Y, Z] bool: none."""
         del camera
         return np.zeros(grid.log_odds.shape, dtype=bool)
 
     def draw(self, situation: Situation, *, key: Array) -> Drawn:
         """Draws views of the nearest frontier cells that were not viewed yet.
 
-        If there are none, any nearby views are drawn.
-
-        The notes are True where views of the frontier were found.
+        If there are none, random nearby views are drawn. The notes are True if views of the
+        frontier were found.
         """
         target_key, random_key = jax.random.split(key)
         num = self.config.num_candidates
         targets, attempted = np.asarray(frontier(situation.scoring_grid)), situation.memory
-        # All were looked at: begin again, since the map has grown meanwhile.
+        # All were viewed: start over, since the map has changed.
         if not np.any(targets & ~attempted):
             attempted = np.zeros_like(attempted)
         fresh = targets & ~attempted
         stops, aims = nearest_views(situation.travel, fresh, num, situation.limits, key=target_key)
         if len(stops) == 0:
-            # The memory stays as it was: random views are no attempt at the frontier.
+            # The memory stays: random views do not aim at the frontier.
             anywhere = free_views(situation.travel, num, self.config.radius, key=random_key)
             return Drawn(anywhere, situation.memory, notes=False)
         return Drawn(candidates_along(stops, aims - stops).padded(num), attempted, notes=True)
 
     def score(self, situation: Situation, candidates: Candidates, *, key: Array) -> Scored:
-        """Leaves the choice to the path alone; random scores if no frontier is in reach."""
+        """Returns equal scores, so that the path decides; random ones without a frontier."""
         lots = {} if situation.notes else draw_lots(len(candidates.valid), key=key)
         return candidates, lots
 
     def score_again(
         self, situation: Situation, candidates: Candidates, *, before: np.ndarray, key: Array
     ) -> Scored:
-        """Keeps the order of the candidates: their target cells are no longer known."""
+        """Keeps the order of the candidates, whose target cells are no longer known."""
         del situation, key
         return candidates, {"lot": before}
 
@@ -102,8 +101,8 @@ class Frontier(GreedyPolicy):
             return situation.memory
         cells = np.moveaxis(np.indices(situation.memory.shape), 0, -1)
         centers = situation.travel.centers(cells)
-        # The pose, not the line of sight: lines to lattice cells lie on the border of the cone, and
-        # float32 has always decided on which side.
+        # The pose, not the direction: lines to cell centers lie on the border of the cone, and
+        # recorded runs depend on its float32 rounding.
         pose = candidates.T_world_camera[best]
         return situation.memory | _is_looked_at(centers, pose)
 
@@ -117,8 +116,8 @@ def _is_looked_at(centers: np.ndarray, T_world_camera: np.ndarray) -> np.ndarray
 
 
 def _may_look(limits: Limits, place: np.ndarray, aim: np.ndarray) -> bool:
-    """Checks whether the nearest allowed view from a place counts as one of the target."""
-    # Never 0 / 0: places nearer than `VIEW_DISTANCE` were dropped before.
+    """Checks whether the nearest allowed view from a position shows the target."""
+    # Never 0 / 0: positions nearer than `VIEW_DISTANCE` were dropped before.
     direction = (aim - place) / np.linalg.norm(aim - place)
     return bool(limits.nearness(place[None], direction[None])[0] >= _ATTEMPT_COSINE)
 
@@ -131,27 +130,27 @@ def nearest_views(
     *,
     key: Array,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Finds up to `num` places with a target cell in plain view, nearest by path first.
+    """Finds up to `num` positions with a free line to a target cell, nearest by path first.
 
     Args:
-        travel: where the robot may stop, and how far that is.
-        targets: free cells to look at, [X, Y, Z] bool.
-        num: places wanted.
+        travel: positions to stop at, and path lengths to them.
+        targets: free cells to view, [X, Y, Z] bool.
+        num: number of positions.
         limits: of the robot; the allowed view nearest to the target must still show it.
-        key: draws the targets that are considered, if there are very many.
+        key: for sampling targets, if there are very many.
 
     Returns:
-        Places and the targets' centers, [n, 3] float64 each [m], n <= num.
+        Positions and the targets' centers, [n, 3] float64 each [m], n <= num.
     """
     cells, stops = np.argwhere(targets), np.argwhere(travel.goals)
     if len(cells) == 0 or len(stops) == 0:
         return np.zeros((0, 3)), np.zeros((0, 3))
-    # Hundreds of targets tell the nearest well enough; thousands take seconds.
+    # Hundreds of targets are enough to find the nearest; thousands take seconds.
     if len(cells) > _MAX_TARGETS:
         cells = host_generator(key).choice(cells, size=_MAX_TARGETS, replace=False)
     closest, farthest = VIEW_DISTANCE
     places, aims = travel.stops(stops), travel.centers(cells)
-    # Far more than are tried: the nearest in a straight line may be far away by path.
+    # Many more than are tried: the nearest in a straight line may be far away by path.
     count = min(64, len(stops))
     distance, index = KDTree(places).query(aims, k=count, distance_upper_bound=farthest)
     # SciPy drops the axis of neighbors if only one is requested.
@@ -164,7 +163,7 @@ def nearest_views(
     aim_index = np.repeat(np.arange(len(cells)), best.shape[1])
     index, cost = (np.take_along_axis(a, best, axis=1).ravel() for a in (index, cost))
     found: list[tuple[np.ndarray, np.ndarray]] = []
-    # Nearest first, so that the costly test of sight ends early.
+    # Nearest first, so that the expensive visibility test ends early.
     for pair in np.argsort(cost, kind="stable"):
         if not np.isfinite(cost[pair]) or len(found) == num:
             break

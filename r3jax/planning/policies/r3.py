@@ -1,9 +1,9 @@
-"""R3 and R3-Pano: go where the closed-form renderability is low (arXiv 2601.07484).
+"""R3 and R3-Pano: choose views with low closed-form renderability (arXiv 2601.07484).
 
     U_view = U / sum U - lambda2 L / sum L,    U = lambda1 U_G + U_R,  L the path length
 
 R3 scores poses with random directions. R3-Pano scores positions and takes the best direction of
-each one's panorama: one depth buffer per position answers for all directions.
+each panorama, which needs only one depth buffer per position.
 
 Shape symbols: C candidates, always `config.num_candidates`, so that scoring compiles once.
 """
@@ -36,7 +36,7 @@ class R3(GreedyPolicy):
     def score(self, situation: Situation, candidates: Candidates, *, key: Array) -> Scored:
         """Computes U = lambda1 U_G + U_R of every view."""
         del key
-        # On the masked grid: cells that no robot can look at would attract it forever.
+        # On the masked grid: cells that the robot can never see would attract it forever.
         views = self.score_all(
             situation.map_state,
             situation.scoring_grid,
@@ -54,7 +54,7 @@ class R3(GreedyPolicy):
 
 @dataclass(frozen=True)
 class R3Pano(GreedyPolicy):
-    """Random nearby and frontier positions; each looks where its panorama needs views most."""
+    """Random nearby and frontier positions; each in the direction of the highest utility."""
 
     score_all: Callable[..., Any] = score_positions
     """Scores positions [C, 3]."""
@@ -68,7 +68,7 @@ class R3Pano(GreedyPolicy):
         return Drawn(random_places(travel, grid, self.config, key=key), situation.memory)
 
     def score(self, situation: Situation, candidates: Candidates, *, key: Array) -> Scored:
-        """Finds every position's best allowed direction in its panorama, and its score."""
+        """Finds the best allowed direction of each position's panorama, and its score."""
         del key
         scoring, limits = self.config.scoring, situation.limits
         panorama = self.score_all(
@@ -79,7 +79,7 @@ class R3Pano(GreedyPolicy):
             scoring,
             limits.allowed_axes(candidates.position, scoring.panorama_bins),
         )
-        # Positions stay, lines of sight are the panorama's choice.
+        # Positions stay; the panorama chooses the directions.
         turned, utility = best_views(candidates, panorama)
         feasible = limits.project_to_feasible(turned)
         return _refined(situation, feasible, {"utility": utility}, self.config)

@@ -1,25 +1,24 @@
-"""R3-Ahead: the first view of the best path of several, through all reachable space.
+"""R3-Ahead: takes the first view of the best path of several views through all reachable space.
 
-Candidates are those of R3-Pano, local ones and some in sight of the frontier, and places that are
-spread over all space that the robot can reach. A beam searches paths of `horizon` views among
-them, each view scored as if those before it had been taken (`scoring.simulated`). The best path's
-first view is taken; then all is planned again. A room that is done is left for one that is not,
-however far, if nothing nearer justifies its time.
+Candidates are those of R3-Pano (local ones and views of the frontier), and positions spread over
+all reachable space. A beam search finds paths of `horizon` views among them, each view scored as if
+those before it had been taken (`scoring.simulated`). The first view of the best path is taken; then
+everything is planned again. So the robot leaves a finished room for an unfinished one, however far,
+if no nearer view is worth its time. # words: ok
 
-A path is compared by what its views add over what it costs, in seconds:
+Paths are compared by their utility per second:
 
     rate = sum of the utility of each view after those before it
            / sum over its views of (seconds of a view + of the path and the turn)
 
-The robot's motion says how long paths and turns take and which views there are; a camera that
-flies goes 1 m/s and turns in no time.
+The robot's motion gives the times of paths and turns and the allowed views; a flying camera moves
+at 1 m/s, and its turns take no time.
 
-From each path of the beam, some places are tried whose panorama scored most when nothing else had
-been seen, which bounds what it can score now, and the last place once more, in another direction.
-What is tried lies apart, in place or direction: a hundred views of one corner are one choice. On
-the host; scores are jitted.
+Each path of the beam is extended by the positions with the highest initial panorama scores, which
+are upper bounds, and by its last position in another direction. Extensions must differ in position
+or direction: a hundred views of one corner are one choice. On the host; scores are jitted.
 
-Shape symbols: C places.
+Shape symbols: C positions.
 """
 
 import math
@@ -58,40 +57,41 @@ from r3jax.scoring.panorama_cache import PanoramaCache
 from r3jax.scoring.simulated import simulate_view_near
 
 _NEIGHBORS = 8
-"""Number of nearest places to which straight paths are tried."""
+"""Number of nearest positions to which straight paths are tried."""
 
 _APART = 0.7
-"""Views from places this far apart are two choices [m]."""
+"""Views from positions this far apart are different choices [m]."""
 
 SPEED = 1.0
-"""Speed of a robot whose motion does not say [m/s]."""
+"""Speed if the motion sets none [m/s]."""
 
 _TURNED = 0.5
-"""Cosine between the axes of two views from one place, below which they are two choices."""
+"""Views from one position are different choices if the cosine between their directions is below
+this."""
 
 
 @dataclass(frozen=True)
 class AheadConfig(PlannerConfig):
-    """How far `r3-ahead` looks, beside what all policies share."""
+    """Settings of the beam search, beside those that all policies share."""
 
     horizon: int = 4
-    """Views of the paths that are compared."""
+    """Number of views of a path."""
 
     num_spread: int = 40
-    """How many of the candidates of it are spread over all reachable space."""
+    """Number of candidates spread over all reachable space."""
 
     beam: int = 4
-    """Paths that it keeps for every further view."""
+    """Width of the beam: paths kept for each further view."""
 
     branching: int = 6
-    """Places that it tries for the next view of each path."""
+    """Number of positions tried for the next view of each path."""
 
     view_seconds: float = 4.0
-    """What it counts for a view, beside the path to it [s]. With 1 it saves meters, looks
-    at what is near once more, and 60 views of an office come out 1 dB worse."""
+    """Time charged for a view, beside the path to it [s]. With 1 s, paths are shorter, nearby
+    surfaces are viewed again, and 60 views of the office are 1 dB worse."""
 
     def __post_init__(self) -> None:
-        """Refuses values that would fail later, and says which."""
+        """Refuses invalid settings."""
         super().__post_init__()
         if self.refine:
             raise InputError("r3-ahead has no refinement: leave refine at 0, or take r3-pano")
@@ -104,7 +104,7 @@ class AheadConfig(PlannerConfig):
 
 @dataclass(frozen=True)
 class R3Ahead(GreedyPolicy):
-    """The first view of the best path of several, each as if those before it had been taken."""
+    """The first view of the best path of several views, each as if those before it were taken."""
 
     config: AheadConfig = field(default_factory=AheadConfig)
 
@@ -115,14 +115,14 @@ class R3Ahead(GreedyPolicy):
     def draw(self, situation: Situation, *, key: Array) -> Drawn:
         """Draws positions as `r3` does, and some spread over all reachable space.
 
-        They have no directions yet.
+        Directions are chosen later.
         """
         travel = situation.travel
         num = self.config.num_candidates
-        # One at least is drawn as `r3` draws it: settings with fewer would be refused.
+        # At least one is drawn as `r3` does: settings with fewer are refused.
         num_spread = min(self.config.num_spread, num - 1)
         num_own = num - num_spread
-        # The shares add up to what every policy scores: comparisons are at equal cost.
+        # The total is that of every policy, so that comparisons are at equal cost.
         own = replace(
             self.config,
             num_candidates=num_own,
@@ -166,7 +166,7 @@ class R3Ahead(GreedyPolicy):
             self.config,
             situation.limits,
         )
-        # Places where no path of the beam begins were beaten: they must not be chosen.
+        # Positions at which no path of the beam begins must not be chosen.
         rate = np.full(len(positions), -np.inf)
         for path in search(problem):
             rate[path.places[0]] = max(rate[path.places[0]], path.rate)
@@ -179,19 +179,19 @@ class R3Ahead(GreedyPolicy):
 
 @dataclass(frozen=True)
 class Path:
-    """Views one after the other, and what is known once they are taken."""
+    """A sequence of views, and the predicted voxels and cells after it."""
 
     places: tuple[int, ...]
-    """Numbers of the places, in order."""
+    """Numbers of the positions, in order."""
 
     directions: tuple[np.ndarray, ...]
-    """Lines of sight there, [3] each."""
+    """Viewing directions, [3] each."""
 
     gains: tuple[float, ...]
     """Utility that each view adds."""
 
     seconds: float
-    """Time that the whole path takes [s]."""
+    """Time of the whole path [s]."""
 
     voxels: MapState
     """Before the last view."""
@@ -202,22 +202,22 @@ class Path:
     @property
     def rate(self) -> float:
         """Gain per second."""
-        # With `view_seconds` 0, a turn on the spot may take no time at all.
+        # With `view_seconds` 0, a turn in place may take no time.
         return sum(self.gains) / max(self.seconds, 1e-9)
 
 
 @dataclass(frozen=True)
 class BeamProblem:
-    """What the search knows of the places."""
+    """The input of the search."""
 
     views: Candidates
-    """The best view from each, if it were the first."""
+    """The best first view from each position."""
 
     utility: np.ndarray
-    """What that is worth, [C]: a bound on what it is worth later."""
+    """Its utility, [C]: an upper bound of its utility later in a path."""
 
     lengths: np.ndarray
-    """Path lengths to each from where the robot is, [C] [m]; inf: there is none."""
+    """Path lengths from the robot to each, [C] [m]; inf: no path."""
 
     between: np.ndarray
     """Path lengths between them, [C, C] [m]."""
@@ -226,13 +226,13 @@ class BeamProblem:
     """The panorama of each."""
 
     start: tuple[MapState, Cells]
-    """What is known: surfaces and unexplored space at hand (`scoring.gather.gather_in_range`)."""
+    """Surfaces and unexplored space in range (`scoring.gather.gather_in_range`)."""
 
     camera: Camera
     config: AheadConfig
 
     limits: Limits = field(default_factory=Limits)
-    """Limits of the robot where it is."""
+    """Limits of the robot at its pose."""
 
     @property
     def speed(self) -> float:
@@ -241,13 +241,13 @@ class BeamProblem:
 
 
 def search(problem: BeamProblem) -> list[Path]:
-    """Searches the paths of the greatest rate, best first; none if no place can be reached."""
+    """Searches the paths of the greatest rate, best first; none if nothing can be reached."""
     config = problem.config
     views = problem.views
     ways = problem.limits.path_costs(problem.lengths, views.direction)
     cost = config.view_seconds + ways / problem.speed
     reachable = np.flatnonzero(np.isfinite(cost))
-    # Gain per second, not gain: else the longest path would always win.
+    # Gain per second, not gain: otherwise the longest path would always win.
     rate = problem.utility[reachable] / np.maximum(cost[reachable], 1e-9)
     ranked = reachable[np.argsort(-rate, kind="stable")]
     beam = [
@@ -261,10 +261,10 @@ def search(problem: BeamProblem) -> list[Path]:
         )
         for i in _apart(ranked.tolist(), views, (), config.beam)
     ]
-    # One path per core: a few milliseconds of work are not split further.
+    # One path per core: a few milliseconds of work are not worth splitting. # words: ok
     with ThreadPoolExecutor(num_cores()) as pool:
         for _ in range(config.horizon - 1):
-            # Parents leave the beam: only paths of as many views compare their rates.
+            # Parents leave the beam: rates are compared among paths with equal numbers of views.
             children = pool.map(lambda path: _expanded(path, problem), beam)
             beam = _best([child for some in children for child in some], config.beam)
     return beam
@@ -273,21 +273,21 @@ def search(problem: BeamProblem) -> list[Path]:
 def lengths_between(travel: Travel, positions: np.ndarray) -> np.ndarray:
     """Computes path lengths between positions [C, 3] that the robot can reach, [C, C] [m].
 
-    Over straight lines between near ones, each safe throughout, or back past the robot: no
-    shorter than the shortest way. Unreachable positions are infinitely far from all others.
+    Over safe straight lines between near ones, or past the robot's position: an upper bound of the
+    shortest path. Unreachable positions are infinitely far from all others.
     """
     num = len(positions)
     # All pairs at once: a hundred positions are few.
     gap = np.linalg.norm(positions[:, None] - positions[None], axis=2)
     direct = np.zeros((num, num))
-    # Column 0 is the place itself, or a repeat of it.
+    # Column 0 is the position itself, or a repeat of it.
     nearest = np.argsort(gap, axis=1, kind="stable")[:, 1 : _NEIGHBORS + 1]
     for i in range(num):
         for j in nearest[i]:
             if direct[i, j] == 0.0 and travel.in_reach(positions[i], positions[j][None])[0]:
                 direct[i, j] = direct[j, i] = max(gap[i, j], 1e-6)  # 0 means "no edge" to SciPy
     over = shortest_path(csr_matrix(direct), directed=False)
-    # Back past the robot is always a way, though rarely a short one.
+    # The path past the robot's position always exists, though it is rarely short.
     own = travel.lengths(positions)
     ways = np.minimum(over, own[:, None] + own[None, :])
     np.fill_diagonal(ways, 0.0)
@@ -295,19 +295,19 @@ def lengths_between(travel: Travel, positions: np.ndarray) -> np.ndarray:
 
 
 def _expanded(path: Path, problem: BeamProblem) -> list[Path]:
-    """Extends the path by one more view, once for each place that is tried."""
+    """Extends the path by one view, for each position that is tried."""
     config, last, views = problem.config, path.places[-1], problem.views
     (pose,) = poses_along(views.position[[last]], path.directions[-1][None])
-    # Turns count from the last view of the path, not from where the robot is now.
+    # Turns count from the last view of the path, not from the robot's current one.
     limits = replace(problem.limits, T_world_camera=pose)
-    # Without the turn, whose direction is not known yet: with a cost too low it stays a bound.
+    # Without the turn, whose direction is not known yet: a lower cost keeps the bound valid.
     cost = config.view_seconds + problem.between[last] / problem.speed
-    # The first panorama bounds what a place can still add: views only take away.
+    # The first panorama is an upper bound: views only reduce utilities.
     bound = (sum(path.gains) + problem.utility) / np.maximum(path.seconds + cost, 1e-9)
     bound[~np.isfinite(problem.lengths) | ~np.isfinite(cost)] = -np.inf
     ranked = [int(i) for i in np.argsort(-bound, kind="stable") if bound[i] > -np.inf]
     taken = [(views.position[i], d) for i, d in zip(path.places, path.directions, strict=True)]
-    # The last place whatever its bound: another direction there takes no way.
+    # The last position in any case: another direction there needs no path.
     tried = [last, *_apart(ranked, views, taken, config.branching - 1)]
     offered = views.take(np.array(tried)).padded(config.branching)  # compiles once
     T = jnp.asarray(pose, dtype=jnp.float32)
@@ -338,7 +338,7 @@ def _expanded(path: Path, problem: BeamProblem) -> list[Path]:
 def _best(paths: list[Path], num: int) -> list[Path]:
     """Selects the `num` paths of the greatest rate; of those through the same places, the first."""
     kept: dict[frozenset[tuple[int, bytes]], Path] = {}
-    # The same views in another order know the same: only the fastest order is kept.
+    # The same views in another order give the same map: only the fastest order is kept.
     for path in sorted(paths, key=lambda path: -path.rate):
         views = zip(path.places, path.directions, strict=True)
         kept.setdefault(frozenset((i, direction.tobytes()) for i, direction in views), path)
@@ -346,13 +346,13 @@ def _best(paths: list[Path], num: int) -> list[Path]:
 
 
 _Sight = tuple[np.ndarray, np.ndarray]
-"""A position and a line of sight, [3] each."""
+"""A position and a viewing direction, [3] each."""
 
 
 def _apart(
     ranked: Sequence[int], views: Candidates, taken: Sequence[_Sight], num: int
 ) -> list[int]:
-    """Selects up to `num` views, in order, each apart from those before it and those taken."""
+    """Selects up to `num` views, in order, each different from those before it and those taken."""
     chosen: list[int] = []
     is_left = np.ones(len(views.position), dtype=bool)
     for other in taken:
@@ -367,9 +367,9 @@ def _apart(
 
 
 def _are_apart(views: Candidates, other: _Sight) -> np.ndarray:
-    """Finds the views that differ enough from one view to be another choice, [C]."""
+    """Finds the views that differ enough from one view, [C]."""
     position, direction = other
     is_far = np.linalg.norm(views.position - position, axis=1) >= _APART
-    # Directions have any length: a product on the other side saves dividing by it.
+    # Directions have any length: multiplying the other side avoids a division.
     lengths = np.linalg.norm(views.direction, axis=1) * np.linalg.norm(direction)
     return is_far | (views.direction @ direction < _TURNED * lengths)

@@ -1,4 +1,4 @@
-"""The floor of every table: any view that can be reached, chosen by chance."""
+"""The random baseline: any reachable view."""
 
 from dataclasses import dataclass
 
@@ -28,5 +28,5 @@ class Random(GreedyPolicy):
         return candidates, draw_lots(len(candidates.valid), key=key)
 
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
-        """Returns the random scores alone: paths cost nothing."""
+        """Returns the random scores: paths cost nothing."""
         return utilities["lot"]

@@ -57,11 +57,11 @@ def test_a_program_answers_and_ends_with_its_input():
     ("code", "says"),
     [
         ("sys.exit(3)", "ended with code 3"),
-        ("raise ValueError('no weights')", "ended with code 1; it said: .*no weights"),
-        ("receive(); os.kill(os.getpid(), 9)", "was killed by SIGKILL, perhaps for its memory"),
-        ("receive(); os.close(1); time.sleep(60)", "closed its output and went on"),
-        ("os.close(0); time.sleep(60)", "closed its input and went on"),
-        ("receive(); os.close(0); time.sleep(60)", "closed its input and went on"),
+        ("raise ValueError('no weights')", "ended with code 1; .*no weights"),
+        ("receive(); os.kill(os.getpid(), 9)", "was killed by SIGKILL, perhaps .* memory"),
+        ("receive(); os.close(1); time.sleep(60)", "closed its output but kept running"),
+        ("os.close(0); time.sleep(60)", "closed its input but kept running"),
+        ("receive(); os.close(0); time.sleep(60)", "closed its input but kept running"),
         ("receive(); os.close(0); sys.exit(4)", "ended with code 4"),
         ("print('Loading ...', flush=True); time.sleep(60)", "print to the standard error"),
         (
@@ -90,7 +90,7 @@ def eventually(holds):
 
 def test_an_answer_to_half_a_question_is_refused():
     """The other half would be the beginning of the next question."""
-    with pytest.raises(PolicyError, match="it sent 20 bytes before it was asked"):
+    with pytest.raises(PolicyError, match="it sent 20 bytes before the request"):
         asked("sys.stdin.buffer.read(8); send(TEXT); time.sleep(60)", x="y" * 1_000_000)
 
 
@@ -101,7 +101,7 @@ def test_a_program_that_hangs_is_given_up_with_what_it_started():
     program = Program(python(code), 0.0)
     pid = program._process.pid
     begin = time.monotonic()
-    with pytest.raises(PolicyError, match=r"no answer to `decide` within 1 s.*child \d+") as told:
+    with pytest.raises(PolicyError, match=r"`decide` within 1 s.*child \d+") as told:
         program.ask(Message("decide"), 1.0)
     assert time.monotonic() - begin < 10.0
     child = int(str(told.value).rpartition("child ")[2])

@@ -1,4 +1,4 @@
-"""Commands in the names of policies: `exec:python my_policy.py`. Light: names are checked early."""
+"""Commands in names of policies: `exec:python my_policy.py`. Imports nothing heavy."""
 
 import shlex
 import shutil
@@ -7,7 +7,7 @@ from pathlib import Path
 from r3jax.errors import InputError
 
 COMMAND = "exec:"
-"""What the names of such policies begin with."""
+"""Prefix of the names of such policies."""
 
 
 def words_of(command: str) -> list[str]:

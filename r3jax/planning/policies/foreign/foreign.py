@@ -1,8 +1,8 @@
-"""A policy that asks a program: what was seen goes to its input, the next view comes back.
+"""A policy that runs a program: frames go to its input, and the next view is read from its output.
 
-The program gets what a policy of this package gets to choose from: candidates that can be reached,
-with the paths to them, and the coarse grid. It answers with one of them, or with a view of its own,
-which must lie where the robot can go, too.
+The program gets the same choice as a policy of this package: reachable candidates with the paths to
+them, and the coarse grid. It replies with one of them, or with its own view, which must be
+reachable, too.
 
 Shape symbols: n frames; H W image size; X Y Z cells; C candidates.
 """
@@ -48,27 +48,27 @@ from r3jax.validation.errors import ForeignFileError
 from r3jax.validation.json_text import check_type
 
 PROTOCOL = 1
-"""Version of the messages."""
+"""Version of the protocol."""
 
 _SAME_PLACE = 1e-6
-"""Positions this close are one [m]."""
+"""Positions closer than this are equal [m]."""
 
 
 @dataclass(frozen=True)
 class ForeignConfig(PlannerConfig):
-    """Limits of a program, and the candidates that it is offered."""
+    """Limits of a program, and settings of the candidates."""
 
     command: str = ""
     """Program and arguments."""
 
     answer_seconds: float = 120.0
-    """Time limit of an answer [s]."""
+    """Time limit for a reply [s]."""
 
     memory: float = 8.0
-    """Limit for the program and all that it has started [GiB]; 0: none."""
+    """Memory limit for the program and its child processes [GiB]; 0: none."""
 
     def __post_init__(self) -> None:
-        """Refuses values that would fail later, and says which."""
+        """Refuses invalid settings."""
         super().__post_init__()
         for name in ("answer_seconds", "memory"):
             if not 0.0 <= getattr(self, name) < 1e6:
@@ -77,25 +77,25 @@ class ForeignConfig(PlannerConfig):
 
 @dataclass
 class _Session:
-    """A program and what it was told: the one thing here that changes."""
+    """A running program and the messages exchanged with it: the only mutable state here."""
 
     program: Program
 
     frames: dict[int, Frame] = field(default_factory=dict[int, Frame])
-    """Frames that it has not been shown yet, by number."""
+    """Frames not sent yet, by number."""
 
     answers: dict[int, tuple[Message, float]] = field(
         default_factory=dict[int, tuple[Message, float]]
     )
-    """Its last answer and the seconds that it took, by the number of frames before it."""
+    """Its last reply and the time that it took [s], by the number of frames before it."""
 
     shown: int = 0
-    """Frames that it has been shown."""
+    """Number of frames sent."""
 
 
 @dataclass(frozen=True)
 class Foreign:
-    """Asks a program of its own: exec:COMMAND."""
+    """Runs an external program: exec:COMMAND."""
 
     config: ForeignConfig = field(default_factory=ForeignConfig)
 
@@ -113,17 +113,17 @@ class Foreign:
 
     @property
     def isolation(self) -> dict[str, Any]:
-        """The limits that hold on this system; None where one cannot."""
+        """The limits that this system can enforce; None for others."""
         return {"memory_gib": self.config.memory if IS_LINUX and self.config.memory else None}
 
     def init(self, camera: Camera, grid: OccupancyGrid, *, key: Array) -> PlannerState:
-        """Starts the program and greets it.
+        """Starts the program and sends `hello`.
 
         Raises:
-            PolicyError: it cannot be started, or does not answer.
+            PolicyError: it cannot be started, or does not reply.
         """
         session = _Session(Program(self.config.command, self.config.memory))
-        # By number, in the state: several cameras may be planned for by one policy.
+        # By number, in the state: one policy may plan for several cameras.
         number = next(n for n in itertools.count() if n not in self._sessions)
         self._sessions[number] = session
         answer = session.program.ask(self._hello(camera, grid, key), self.config.answer_seconds)
@@ -155,10 +155,10 @@ class Foreign:
         )
 
     def observe(self, state: PlannerState, map_state: MapState, frame: Frame) -> PlannerState:
-        """Keeps the frame for the next question."""
+        """Stores the frame for the next request."""
         del map_state
         session, seen = self._session(state.memory)
-        # By number: a call that is made again to be timed changes nothing.
+        # By number: repeating a call, for timing, changes nothing.
         session.frames[seen] = frame
         return replace(state, memory=state.memory + np.array([0, 1]))
 
@@ -174,9 +174,9 @@ class Foreign:
         """Lets the program choose a view, and plans the path to it.
 
         Raises:
-            PolicyError: no answer, or one that cannot be taken; the program has ended then.
+            PolicyError: no reply, or an invalid one; the program has been stopped.
         """
-        # As a policy of this package: the same key offers the same candidates.
+        # As in other policies, the same key gives the same candidates.
         rule = Rule(self._draw, self._ask, operator.itemgetter("utility"))
         return decide(rule, (state, map_state, grid, T_world_camera), self.config, key=key)
 
@@ -185,10 +185,10 @@ class Foreign:
         return Drawn(random_views(travel, grid, self.config, key=key), situation.memory)
 
     def _ask(self, situation: Situation, candidates: Candidates, *, key: Array) -> Scored:
-        """Offers the candidates; the utility is 1 for the view that the program chooses, else 0.
+        """Sends the candidates; the utility is 1 for the chosen view, else 0.
 
         Raises:
-            PolicyError: no answer, or one that cannot be taken.
+            PolicyError: no reply, or an invalid one.
         """
         session, seen = self._session(situation.memory)
         offered = candidates.take(np.isfinite(_costs(candidates, situation)))
@@ -200,9 +200,7 @@ class Foreign:
             _check_view(answer, seen)
             chosen = _view_of(answer, offered, situation)
         except ForeignFileError as error:
-            raise self._refused(
-                session, f"received the question for view {seen}: {error}"
-            ) from None
+            raise self._refused(session, f"received the request for view {seen}: {error}") from None
         if chosen is None:
             nothing = replace(offered, valid=np.zeros_like(offered.valid))
             return nothing, {"utility": np.zeros(len(offered.valid))}
@@ -222,13 +220,13 @@ class Foreign:
         return with_path(state, situation.travel, waypoints)
 
     def close(self) -> None:
-        """Ends the programs."""
+        """Stops the programs."""
         while self._sessions:
             _, session = self._sessions.popitem()
             session.program.close()
 
     def _session(self, memory: Any) -> tuple[_Session, int]:
-        """Finds the session of a memory, and the number of frames that it has observed.
+        """Finds the session of a memory, and its number of observed frames.
 
         Raises:
             PolicyError: it has ended.
@@ -239,18 +237,18 @@ class Foreign:
         return self._sessions[number], seen
 
     def _answer(self, session: _Session, seen: int, question: Message) -> Message:
-        """Asks, with all frames that the program has not seen; the same question only once.
+        """Sends a request with all frames not sent yet; repeated requests return the cached reply.
 
         Raises:
-            PolicyError: no answer, or a question about what is long gone.
+            PolicyError: no reply, or a request about an earlier state.
         """
         if seen in session.answers:
             answer, seconds = session.answers[seen]
-            # Asked again to be timed, without what was compiled: it takes as long as it took.
+            # Requested again, for timing without compilation: it takes as long as before.
             time.sleep(seconds)
             return answer
         numbers = sorted(number for number in session.frames if number < seen)
-        # A state of the past, or one that was stored: the program would know less or more than it.
+        # An earlier or a stored state: the program has seen more or fewer frames.
         if seen < session.shown or numbers != list(range(session.shown, seen)):
             raise PolicyError(
                 f"the program {self.config.command!r} has seen {session.shown} frames and cannot "
@@ -265,7 +263,7 @@ class Foreign:
         return answer
 
     def _refused(self, session: _Session, reason: str) -> PolicyError:
-        """Ends the program, and returns an error for its unusable answer."""
+        """Stops the program, and returns an error for its invalid reply."""
         session.program.close()
         return PolicyError(f"the program {self.config.command!r} {reason}")
 
@@ -294,7 +292,7 @@ def _images(frames: list[Frame]) -> dict[str, np.ndarray]:
 
 
 def _shown(situation: Situation, offered: Candidates) -> dict[str, np.ndarray]:
-    """Collects the camera's pose, the views on offer, and the known space."""
+    """Collects the camera's pose, the candidates, and the known space."""
     free, occupied = np.asarray(situation.grid.free), np.asarray(situation.grid.occupied)
     travel = situation.travel
     return {
@@ -308,7 +306,7 @@ def _shown(situation: Situation, offered: Candidates) -> dict[str, np.ndarray]:
 
 
 def _check_view(answer: Message, seen: int) -> None:
-    """Refuses an answer to another question: one message too many would shift all later ones.
+    """Refuses a reply to another request: one extra message would shift all later ones.
 
     Raises:
         ForeignFileError: it names another view, or none.
@@ -317,17 +315,17 @@ def _check_view(answer: Message, seen: int) -> None:
     if type(view) is not int or view != seen:
         named = f"is for view {view!r:.20}" if "view" in answer.fields else "is missing `view`"
         raise ForeignFileError(
-            f"its answer {named}: repeat the question's, and send one message for each question"
+            f"its reply {named}: repeat the request's `view`, and send one message per request"
         )
 
 
 def _view_of(
     answer: Message, offered: Candidates, situation: Situation
 ) -> tuple[Candidates, int] | None:
-    """Adds the program's view to those on offer, and finds its number; None: no view.
+    """Adds the program's view to the candidates, and returns its number; None: no view.
 
     Raises:
-        ForeignFileError: the answer is none, or names a view that cannot be taken; says why.
+        ForeignFileError: an invalid reply, or a view that cannot be taken; says why.
     """
     if answer.kind == "done":
         return None
@@ -341,7 +339,7 @@ def _view_of(
         return offered, index
     if answer.kind != "view":
         raise ForeignFileError(
-            f"{answer.kind!r:.80} is no answer: send `candidate`, `view` or `done`"
+            f"{answer.kind!r:.80} is not a valid reply: send `candidate`, `view` or `done`"
         )
     travel = situation.travel
     own = situation.limits.project_to_feasible(
@@ -361,7 +359,7 @@ def _view_of(
 
 
 def _point(answer: Message, name: str) -> np.ndarray:
-    """Reads three finite numbers of an answer; a direction must have a length.
+    """Reads three finite numbers of a reply; a direction must not be 0.
 
     Raises:
         ForeignFileError: they are not there.

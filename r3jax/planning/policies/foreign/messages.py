@@ -6,7 +6,7 @@
     M bytes   the arrays one behind the other, little-endian, rows first
 
 The header has a `kind`, and `arrays`: a list of objects with `name`, `dtype` and `shape`, in the
-order of their bytes; questions have arrays, answers have none. Nothing in a message is ever
+order of their bytes; requests have arrays, replies have none. Nothing in a message is ever
 executed.
 """
 
@@ -32,7 +32,7 @@ DTYPES = {"uint8": "|u1", "int32": "<i4", "int64": "<i8", "float32": "<f4", "flo
 
 
 class MessageError(InputError):
-    """Bytes that are no message."""
+    """Bytes that are not a message."""
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,10 @@ class Message:
     """One message."""
 
     kind: str
-    """What it is: `hello`, `decide`, `view`, ..."""
+    """Its kind: `hello`, `decide`, `view`, ..."""
 
     fields: dict[str, Any] = field(default_factory=dict[str, Any])
-    """What else the header says."""
+    """The other fields of the header."""
 
     arrays: dict[str, np.ndarray] = field(default_factory=dict[str, np.ndarray])
     """By name."""
@@ -53,8 +53,8 @@ def encode(message: Message) -> bytes:
     """Encodes a message in bytes.
 
     Raises:
-        ValueError: numbers that JSON does not know, arrays of a kind that is not sent, or too
-            many bytes.
+        ValueError: numbers that JSON cannot represent, arrays of an unsupported type, or too many
+            bytes.
     """
     arrays = {name: np.ascontiguousarray(array) for name, array in message.arrays.items()}
     for name, array in arrays.items():
@@ -75,10 +75,10 @@ def encode(message: Message) -> bytes:
 
 
 def length_of(prefix: bytes) -> int:
-    """Reads the length of the answer that begins with these 8 bytes, including them [bytes].
+    """Reads the length of the reply that begins with these 8 bytes, including them [bytes].
 
     Raises:
-        MessageError: it is too long, or has arrays: most likely they are no message.
+        MessageError: it is too long, or has arrays: most likely not a message.
     """
     header, data = PREFIX.unpack(prefix)
     if header > MAX_HEADER or data:
@@ -91,10 +91,10 @@ def length_of(prefix: bytes) -> int:
 
 
 def decode(data: bytes) -> Message:
-    """Decodes the answer in bytes: inverse of `encode` for a message without arrays.
+    """Decodes a reply: inverse of `encode` for a message without arrays.
 
     Raises:
-        MessageError: they are none; says why.
+        MessageError: not a valid message; says why.
     """
     if len(data) < PREFIX.size or len(data) != length_of(data[: PREFIX.size]):
         raise MessageError(f"{len(data)} bytes are not a whole message")
@@ -104,7 +104,7 @@ def decode(data: bytes) -> Message:
         kind, arrays = plain.pop("kind", None), plain.pop("arrays", [])
         check_type("kind", kind, str)
         if arrays != []:
-            raise ForeignFileError("`arrays` must be empty in an answer")
+            raise ForeignFileError("`arrays` must be empty in a reply")
         return Message(kind, plain)
     except ForeignFileError as error:
-        raise MessageError(f"the header is not understood: {error}") from None
+        raise MessageError(f"the header cannot be parsed: {error}") from None

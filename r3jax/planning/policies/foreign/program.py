@@ -1,6 +1,7 @@
-"""A program that answers messages: started under limits, always ended, in time.
+"""Runs a program that exchanges messages, with limits of time and memory, and always stops it.
 
-No sandbox: it has the rights of the user who starts it (`docs/howto/policy.md`).
+This is not a sandbox: the program has the rights of the user who starts it
+(`docs/howto/policy.md`).
 """
 
 import contextlib
@@ -27,28 +28,28 @@ from r3jax.planning.policies.foreign.messages import (
 from r3jax.planning.policy import PolicyError
 
 IS_LINUX = sys.platform == "linux"
-"""Memory is limited on Linux alone."""
+"""Memory limits are only supported on Linux."""
 
 _CHUNK = 1 << 16
 _TAIL = 2000
-"""Last bytes of its standard error that are kept."""
+"""Number of bytes kept of its standard error."""
 
 _GRACE = 1.0
-"""A program whose input has ended may take so long to end [s]."""
+"""Grace period for a program to exit after its input has ended [s]."""
 
 _MEASURE_EVERY = 0.25
-"""Pause between two measurements of its memory while it computes [s]."""
+"""Interval between two measurements of its memory [s]."""
 
 
 class Program:
     """A program and its pipes."""
 
     def __init__(self, command: str, memory: float) -> None:
-        """Starts it.
+        """Starts the program.
 
         Args:
             command: program and arguments, as for a shell.
-            memory: limit for it and all that it has started [GiB]; 0: none.
+            memory: limit for it and its child processes [GiB]; 0: none.
 
         Raises:
             ValueError: there is no such program.
@@ -56,12 +57,12 @@ class Program:
         """
         self.command = command
         self._memory = int(memory * (1 << 30))
-        # On Linux a parent that is killed ends its program, one that hangs, too.
+        # On Linux the program ends with its parent, even if the parent is killed.
         setpriv = shutil.which("setpriv") if IS_LINUX else None
         first = [setpriv, "--pdeathsig", "KILL"] if setpriv else []
         pipe = subprocess.PIPE
         try:
-            # A session of its own: it is ended as a group, and Ctrl-C is the loop's.
+            # A separate session: it is stopped as a group, and Ctrl-C is handled by the loop.
             self._process = subprocess.Popen(
                 [*first, *words_of(command)],
                 stdin=pipe, stdout=pipe, stderr=pipe, bufsize=0, start_new_session=True,
@@ -76,11 +77,11 @@ class Program:
         self.close = weakref.finalize(self, _end, self._process)
 
     def ask(self, message: Message, seconds: float) -> Message:
-        """Sends a message and waits for the answer.
+        """Sends a message and waits for the reply.
 
         Raises:
-            PolicyError: no answer in time, none at all, or something else than a message; more
-                memory than allowed. The program has ended then.
+            PolicyError: no reply, no reply in time, an invalid message, or more memory than
+                allowed. The program has been stopped.
         """
         if not self.close.alive:
             raise PolicyError(f"the program {self.command!r} has ended")
@@ -89,26 +90,26 @@ class Program:
             self._check_memory()
             return answer
         except TimeoutError:
-            reason = f"gave no answer to `{message.kind}` within {seconds:g} s"
+            reason = f"did not reply to `{message.kind}` within {seconds:g} s"
         except MemoryError as error:
             reason = str(error)
         except EOFError as error:
             reason = self._death(str(error))
         except MessageError as error:
-            reason = f"sent no answer to `{message.kind}`: {error}"
+            reason = f"did not reply to `{message.kind}`: {error}"
         self.close()
         said = " ".join(self._said.decode("utf-8", "replace").split())
-        last = f"; it said: {said[-600:]}" if said else ""
+        last = f"; its standard error ends with: {said[-600:]}" if said else ""
         raise PolicyError(f"the program {self.command!r} {reason}{last}")
 
     def _exchange(self, data: bytes, end: float) -> bytes:
         """Writes and reads at the same time, so that neither side blocks the other.
 
         Raises:
-            TimeoutError: it is past `end` on the monotonic clock.
+            TimeoutError: `end` on the monotonic clock has passed.
             EOFError: the program has closed its `input` or its `output`, as the text says.
-            MemoryError: the program takes more than it may.
-            MessageError: the bytes are no message, or come before the question is sent.
+            MemoryError: the program takes more than allowed.
+            MessageError: the bytes are not a message, or come before the request is sent.
         """
         streams = self._process.stdin, self._process.stdout, self._process.stderr
         into, out, errors = (pipe.fileno() for pipe in streams if pipe is not None)
@@ -133,34 +134,38 @@ class Program:
                         return bytes(inbox)
                     if not chunk:
                         raise EOFError("output")
-                elif into in ready:  # an answer comes first: it may close its input after that
+                elif (
+                    into in ready
+                ):  # a reply counts first: the program may close its input afterwards
                     if not left:
                         raise EOFError("input")
                     left = left[_write(into, left) :]
-                    if not left:  # there is nothing to read: ready once the other end is closed
+                    if (
+                        not left
+                    ):  # nothing is read from it: it becomes ready when the other end is closed
                         selector.modify(into, selectors.EVENT_READ)
 
     def _check_memory(self) -> None:
-        """Measures the sum over its processes, which a limit on each does not bound.
+        """Checks the total memory of its processes, which limits per process do not bound.
 
         Raises:
-            MemoryError: the program and all that it has started take more than they may.
+            MemoryError: the program and its child processes take more than allowed.
         """
         if not self._memory or not IS_LINUX:
             return
         family = _family(self._process.pid)
-        # Shared pages are in the size of each process: if that is too much, they are divided.
+        # Shared pages count in each process: if the sum is too large, count them proportionally.
         taken = sum(_size(one) for one in family)
         if taken > self._memory:
             taken = sum(_size(one, divided=True) for one in family)
         if taken > self._memory:
             raise MemoryError(
-                f"takes {taken / (1 << 30):.2f} GiB with all that it has started, its memory is "
+                f"takes {taken / (1 << 30):.2f} GiB with its child processes, the limit is "
                 f"{self._memory / (1 << 30):g} GiB"
             )
 
     def _listen(self, errors: int) -> bool:
-        """Keeps the end of its standard error; False at its end."""
+        """Reads its standard error and keeps the last bytes; False at its end."""
         said = os.read(errors, _CHUNK)
         self._said = (self._said + said)[-_TAIL:]
         return bool(said)
@@ -173,32 +178,32 @@ class Program:
             while self._listen(self._process.stderr.fileno()):
                 pass
         if code is None:
-            return f"closed its {closed} and went on"
+            return f"closed its {closed} but kept running"
         if code < 0:
-            return f"was killed by {signal.Signals(-code).name}, perhaps for its memory"
+            return f"was killed by {signal.Signals(-code).name}, perhaps because of its memory"
         return f"ended with code {code}"
 
 
 def _is_whole(inbox: bytearray, asked: bool) -> bool:
-    """Checks whether a message has arrived whole; `asked`: the question has been sent.
+    """Checks whether a complete message has arrived; `asked`: the request has been sent.
 
     Raises:
-        MessageError: too long, more than one, or before the question.
+        MessageError: too long, more than one, or before the request.
     """
     is_short = len(inbox) < PREFIX.size
     missing = (PREFIX.size if is_short else length_of(bytes(inbox[: PREFIX.size]))) - len(inbox)
     if missing < 0:
         raise MessageError(f"{-missing} bytes more than one message were sent")
-    if inbox and not asked:  # taken for the answer, it would shift all later ones by one
+    if inbox and not asked:  # taken for the reply, it would shift all later ones by one
         raise MessageError(
-            f"it sent {len(inbox)} bytes before it was asked: send one message for each question, "
+            f"it sent {len(inbox)} bytes before the request: send one message per request, "
             "after reading it, and print to the standard error"
         )
     return missing == 0
 
 
 def _write(into: int, left: memoryview) -> int:
-    """Writes as much as the pipe takes.
+    """Writes as much as the pipe accepts.
 
     Raises:
         EOFError: the other end is closed.
@@ -212,10 +217,10 @@ def _write(into: int, left: memoryview) -> int:
 
 
 def _wait(process: "subprocess.Popen[bytes]") -> int | None:
-    """Waits a moment for a program to end; its code as `Popen` has it, None: it has not ended."""
+    """Waits briefly for a program to end; returns its exit code as `Popen` does, or None."""
     end = time.monotonic() + _GRACE
     while True:
-        # Left to be reaped: until then its number, that of its group, cannot become another's.
+        # Not reaped yet: until then its process id, which is that of its group, is not reused.
         how = os.WEXITED | os.WNOHANG | os.WNOWAIT
         if (found := os.waitid(os.P_PID, process.pid, how)) is not None:
             return found.si_status if found.si_code == os.CLD_EXITED else -found.si_status
@@ -225,12 +230,12 @@ def _wait(process: "subprocess.Popen[bytes]") -> int | None:
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:
-    """Ends a program, its group, and the processes below it."""
+    """Stops a program, its group, and its descendants."""
     started = _family(process.pid)
     for pipe in (process.stdin, process.stdout):
         assert pipe is not None
         pipe.close()
-    _wait(process)  # the end of its input is its sign to go
+    _wait(process)  # the end of its input tells it to exit
     with contextlib.suppress(ProcessLookupError, PermissionError):
         os.killpg(process.pid, signal.SIGKILL)
     for one in [*started, *_family(process.pid)]:
@@ -242,12 +247,12 @@ def _end(process: "subprocess.Popen[bytes]") -> None:
 
 
 def _limit_memory(pid: int, memory: int) -> None:
-    """Limits each process of a program that has just begun [bytes]; 0: not at all."""
+    """Limits each process of a program that has just started [bytes]; 0: no limit."""
     if not memory or not IS_LINUX:
         return
     with contextlib.suppress(psutil.Error):
-        # Not the address space: that of GPUs and of sparse tables is reserved, never used. Files
-        # in memory (/dev/shm, memfd) count for no process: none may be larger either.
+        # Not the address space: GPUs and sparse tables reserve much more than they use. Files in
+        # memory (/dev/shm, memfd) count for no process: their size is limited, too.
         for limit in (psutil.RLIMIT_DATA, psutil.RLIMIT_FSIZE):
             psutil.Process(pid).rlimit(limit, (memory, memory))
 
@@ -261,7 +266,7 @@ def _family(pid: int) -> list[psutil.Process]:
 
 
 def _size(process: psutil.Process, *, divided: bool = False) -> int:
-    """Measures the memory of a process [bytes]; `divided`: with its part of shared pages."""
+    """Measures the memory of a process [bytes]; `divided`: with its proportion of shared pages."""
     with contextlib.suppress(psutil.Error):
         return int(process.memory_full_info().pss if divided else process.memory_info().rss)
     return 0
