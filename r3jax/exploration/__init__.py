@@ -1,4 +1,7 @@
-"""The loop: decide, fly, look, remember. It knows worlds only as `simulators.base.Simulator`."""
+"""The exploration loop: decide, move, render, map.
+
+It uses worlds only as `simulators.base.Simulator`.
+"""
 
 import lazy_loader
 

@@ -1,8 +1,8 @@
-"""The frames of one path: those captured while moving, and the last one, the view that was chosen.
+"""The frames of one path: those captured while moving, and the chosen view at its end.
 
-A path is cut into equal pieces, with a frame at the end of each. The flight takes as long as the
-decision says, with or without captures: the camera turns while it moves, never so far that it would
-be late for the chosen view (`planning.turning`). Without captures a path is one piece.
+A path is divided into equal pieces, with a frame at the end of each. Captures do not change the
+time of the flight: the camera turns while it moves, but never so far that it would be late for the
+chosen view (`planning.turning`). Without captures a path is one piece.
 
 Shape symbols: n frames; K waypoints.
 """
@@ -38,7 +38,7 @@ class CaptureSettings:
     """Everything that is fixed during a run and determines the frames along paths."""
 
     config: ExplorationConfig
-    """How long pieces are, and where to look."""
+    """Settings of the pieces and of the gaze."""
 
     motion: Motion
     """The robot."""
@@ -53,18 +53,18 @@ class CaptureSettings:
 
     @property
     def gaze(self) -> str:
-        """Where the camera looks; one that cannot turn by itself looks ahead."""
+        """The gaze; a camera that cannot turn by itself looks ahead."""
         return "ahead" if self.motion.fixed_camera else self.config.gaze
 
     @property
     def speed(self) -> float:
-        """Along the path [m/s]."""
+        """Speed along the path [m/s]."""
         return self.motion.speed or self.config.speed
 
     def flight(self, decision: Decision) -> float:
-        """Returns the seconds of the flight to the chosen view.
+        """Returns the time of the flight to the chosen view [s].
 
-        If the policy plans its own motion, they are the policy's.
+        If the policy plans its own motion, it is the policy's.
         """
         if decision.seconds is not None:
             return decision.seconds
@@ -87,22 +87,22 @@ class Leg:
     info: PlanInfo
 
     places: np.ndarray
-    """Places of the frames, [n, 3] [m]; the last one is that of the chosen view."""
+    """Positions of the frames, [n, 3] [m]; the last one is that of the chosen view."""
 
     lengths: np.ndarray
     """Lengths of the pieces of the path, [n] [m]."""
 
     seconds: np.ndarray
-    """Time for each piece, [n] [s]; the last one with what is left of the turn."""
+    """Time for each piece, [n] [s]; the last one includes the rest of the turn."""
 
     turning: Turning
-    """How far the camera can turn on each piece."""
+    """Maximum turn of the camera on each piece."""
 
     taken: int = 0
-    """Frames that were captured so far."""
+    """Number of frames captured so far."""
 
     hidden: float = 0.0
-    """Planning of the decision that the flight before it hid [s]."""
+    """Planning time of the decision that was hidden by the flight before it [s]."""
 
     @property
     def is_last(self) -> bool:
@@ -128,15 +128,17 @@ class Leg:
 def begin_leg(
     decision: Decision, info: PlanInfo, T_world_camera: np.ndarray, rules: CaptureSettings
 ) -> Leg:
-    """Cuts the path of a decision into pieces.
+    """Divides the path of a decision into pieces.
 
     A path no longer than a piece, or too short for its turn, has no frame before its end.
 
     Args:
-        decision: where to.
-        info: of the decision.
-        T_world_camera: where from, [4, 4].
-        rules: how long pieces are.
+        decision: the decision.
+
+        info: information on it.
+        T_world_camera: pose at the start of the path, [4, 4].
+
+        rules: settings of the pieces.
     """
     longest = rules.config.piece_at(rules.speed)
     num = max(1, math.ceil(decision.length / longest - 1e-6))
@@ -175,9 +177,9 @@ def allowed_turns(stops: np.ndarray, seconds: np.ndarray, rules: CaptureSettings
     """Computes the largest turn on each piece of a path, [n] [rad]; inf if it is not limited.
 
     Args:
-        stops: where the pieces begin and end, [n + 1, 3] [m].
+        stops: ends of the pieces, [n + 1, 3] [m].
         seconds: time for each piece, [n] [s].
-        rules: what limits turns.
+        rules: settings that limit turns.
     """
     config, motion = rules.config, rules.motion
     allowed = np.full(len(seconds), np.inf)
@@ -211,10 +213,12 @@ def aim(
     """Finds the pose of the next frame captured while moving, [4, 4] float64.
 
     Args:
-        leg: which frame it is.
+        leg: the path.
+
         T_world_camera: of the frame before, [4, 4].
-        planner: what is known, that frame included.
-        rules: where to look.
+        planner: the planner, including that frame.
+
+        rules: settings of the gaze.
     """
     now, piece, place = direction_of(T_world_camera), leg.taken, leg.places[leg.taken]
     turning = leg.turning
@@ -233,8 +237,8 @@ def observe_view(
 ) -> Planner:
     """Calls `observe` with a frame of the loop.
 
-    No decision follows a frame that was captured while moving: the cells that it failed to show
-    are counted here.
+    No decision follows a frame captured while moving, so that cells that it failed to show are
+    counted here.
     """
     planner = take_in(planner, frame)
     if not captured:

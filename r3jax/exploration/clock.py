@@ -14,7 +14,7 @@ T = TypeVar("T")
 
 @runtime_checkable
 class Clock(Protocol):
-    """Turns what a stage took on this machine into what the mission is charged for it."""
+    """Converts the measured time of a stage into the time charged to the mission."""
 
     @property
     def measures(self) -> bool:
@@ -28,7 +28,7 @@ class Clock(Protocol):
 
 @dataclass(frozen=True)
 class WallClock:
-    """Charges what was measured."""
+    """Charges the measured time."""
 
     measures: bool = True
 
@@ -39,7 +39,7 @@ class WallClock:
 
 @dataclass(frozen=True)
 class ModelClock:
-    """Charges a fixed cost per stage, so that the same run twice is the same run."""
+    """Charges a fixed cost per stage, so that runs are repeatable."""
 
     costs: dict[str, float]
     """Seconds per call, by stage; `reconsidering` a decision that was made while moving, `gaze` per
@@ -48,7 +48,7 @@ class ModelClock:
     measures: bool = False
 
     def charge(self, stage: str, measured: float) -> float:
-        """Returns the fixed cost of the stage, whatever was measured."""
+        """Returns the fixed cost of the stage."""
         return self.costs[stage]
 
 
@@ -88,23 +88,23 @@ compilations = _Compilations()
 def timed(
     function: Callable[..., T], *args: Any, repeat_compiled: bool, **kwargs: Any
 ) -> tuple[T, float]:
-    """Calls a pure function and measures it, compile time left out.
+    """Calls a pure function and measures its time without compilation.
 
-    Compiling is an artifact of this software (and absent on the second run, thanks to the
-    persistent cache), so it must not eat a mission's budget. If anything was compiled during
-    the call, the call is made again and the second one is timed: the function is pure, so the
-    result is the same.
+    Compilation is an artifact of this software (and absent in a second run, thanks to the
+    persistent cache), so it is not charged to the mission. If anything was compiled during the
+    call, the call is repeated and the second one is timed; the result is the same, because the
+    function is pure.
 
     Args:
         function: a pure function of its arguments.
-        *args: handed to it.
-        repeat_compiled: False where the exact time is not needed.
-        **kwargs: handed to it.
+        *args: its arguments.
+        repeat_compiled: False if the exact time is not needed.
+        **kwargs: its keyword arguments.
 
     Returns:
-        The result, ready, and the seconds it took.
+        The result, ready, and its time [s].
     """
-    # Events, not a warm-up call: a table of the map that grows compiles again in mid-mission.
+    # Events, not a warm-up call: a growing map causes recompilation during the mission.
     before = compilations.count
     result, seconds = _measure(function, *args, **kwargs)
     if repeat_compiled and compilations.count > before:
@@ -113,7 +113,7 @@ def timed(
 
 
 def _measure(function: Callable[..., T], *args: Any, **kwargs: Any) -> tuple[T, float]:
-    # JAX returns before the device is done: without the wait only the dispatch would be charged.
+    # JAX returns before the device is done: without waiting only the dispatch would be charged.
     start = time.perf_counter()
     result = jax.block_until_ready(function(*args, **kwargs))
     return result, time.perf_counter() - start

@@ -1,4 +1,4 @@
-"""What the map and the grid know, in numbers: computed beside the mission, not on its clock.
+"""Measures the progress of map and grid; not on the mission clock.
 
 Shape symbols: P probe views; X Y Z cells.
 """
@@ -18,10 +18,10 @@ from r3jax.mapping.state import MapState
 from r3jax.scoring.renderability import renderability
 
 _NUM_DRAWN = 1 << 14
-"""Probe poses drawn over the scene's box; most of them lie in walls or outside."""
+"""Number of probe poses drawn in the scene's box; most of them are in walls or outside."""
 
 _MAX_ELEVATION = np.deg2rad(45.0)
-"""Probes look at most this far up or down."""
+"""Maximum elevation of probe views."""
 
 
 @jax.jit
@@ -41,13 +41,13 @@ def view_renderability(
 @functools.lru_cache(maxsize=4)
 def _probe_sequence(lower: tuple[float, ...], upper: tuple[float, ...]) -> tuple[np.ndarray, ...]:
     """Draws positions [n, 3] and directions [n, 3], evenly spread, the same for every run."""
-    from scipy.stats import qmc  # half a second, which a page that only looks on need not wait for
+    from scipy.stats import qmc  # lazy: takes half a second, which pages do not need
 
     # Not scrambled: equal runs must write equal rows, and runs of one scene share their probes.
     unit = qmc.Sobol(d=5, scramble=False).random(_NUM_DRAWN)
     positions = np.asarray(lower) + unit[:, :3] * (np.asarray(upper) - np.asarray(lower))
     azimuth = 2.0 * np.pi * unit[:, 3]
-    # Uniform in the sine of the elevation is uniform on the sphere; in the angle it is not.
+    # Uniform in the sine of the elevation, which is uniform on the sphere.
     z = (2.0 * unit[:, 4] - 1.0) * np.sin(_MAX_ELEVATION)
     level = np.sqrt(1.0 - z * z)
     return positions, np.stack([level * np.cos(azimuth), level * np.sin(azimuth), z], axis=1)
@@ -56,18 +56,19 @@ def _probe_sequence(lower: tuple[float, ...], upper: tuple[float, ...]) -> tuple
 def probe_poses(grid: OccupancyGrid, num: int) -> np.ndarray:
     """Returns the probe views: the first `num` of a fixed sequence that lie in free space.
 
-    The sequence covers the whole box and does not depend on the run. A probe counts once its
-    cell and all the cells round it are known to be free, so the set grows into every new room
-    and settles when the free space is known.
+    The sequence covers the whole box and does not depend on the run. A probe counts once its cell
+    and all neighboring cells are known to be free, so that the set grows with every new room and is
+    final when the free space is known.
 
     Args:
-        grid: what is known.
-        num: probes at most.
+        grid: the grid.
+
+        num: maximum number of probes.
 
     Returns:
         `T_world_camera`, [P, 4, 4] float32, P <= num.
     """
-    # On the host: the number of free probes changes with every view, and would compile again.
+    # On the host: the number of free probes changes with every view, which would recompile.
     origin, size = np.asarray(grid.origin, np.float64), float(grid.cell_size)
     shape = np.asarray(grid.log_odds.shape)
     positions, directions = _probe_sequence(tuple(origin), tuple(origin + shape * size))
@@ -79,7 +80,7 @@ def probe_poses(grid: OccupancyGrid, num: int) -> np.ndarray:
 
 
 def _poses_along(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Computes `geometry.cameras.pose_along` for many on the host, where their number may vary."""
+    """Computes `geometry.cameras.pose_along` for many on the host, without compiling."""
     # Camera axes: x right and level, y down, z forward.
     right = np.stack([directions[:, 1], -directions[:, 0], np.zeros(len(directions))], axis=1)
     right /= np.linalg.norm(right, axis=1, keepdims=True)  # never 0: no probe looks straight up
@@ -90,14 +91,14 @@ def _poses_along(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
 
 
 def mean_renderability(map_state: MapState, grid: OccupancyGrid, camera: Camera, num: int) -> float:
-    """Computes the mean renderability of the probe views; 0 while there is none."""
+    """Computes the mean renderability of the probe views; 0 if there are none yet."""
     poses = probe_poses(grid, num)
     if len(poses) == 0:
         return 0.0
     # Padded to one length, so that one compilation serves the whole run.
     padded = np.concatenate([poses, np.repeat(poses[:1], num - len(poses), axis=0)])
     values = _renderability_of_views(map_state, camera, jnp.asarray(padded))
-    # Without the padding, which would count the first probe several times.
+    # Without the padding, which repeats the first probe.
     return float(np.asarray(values)[: len(poses)].mean())
 
 
@@ -109,7 +110,7 @@ def measure_coverage(
     arrival_renderability: float,
     num_probes: int,
 ) -> Coverage:
-    """Measures everything that a row says about the state after its view."""
+    """Measures the fields of a row that describe the state after its view."""
     unexplored = np.asarray(grid.unexplored)
     known = int(unexplored.size - unexplored.sum())
     return Coverage(

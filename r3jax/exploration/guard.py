@@ -1,7 +1,7 @@
-"""The loop's access to the world: worlds that can be explored, images from where the camera is.
+"""Guards the loop's access to the world: checks it, and renders only at the camera's pose.
 
-A policy never gets a simulator. Should one reach the loop's nevertheless, it finds a guard, whose
-`render` answers for the pose to which the loop has committed itself, once.
+Policies never get a simulator. If one obtains the loop's nevertheless, it is a guard, which renders
+only the pose committed by the loop, and only once.
 """
 
 import numpy as np
@@ -15,13 +15,13 @@ from r3jax.planning.robot.motion import Motion
 from r3jax.simulators.base import Simulator
 
 _LEAST_EXTENT = 1.0
-"""Smaller worlds have no place with half a meter free all round [m]."""
+"""Smaller worlds have no position with half a meter of free space around it [m]."""
 
 _LEAST_HEIGHT = 0.1
 """Thinner ones are surfaces [m]."""
 
 _LEAST_HOUSE, _LARGEST_HOUSE = 2.0, 500.0
-"""Extents that what is explored usually has [m]."""
+"""Usual extents of explored scenes [m]."""
 
 
 def first_pose(simulator: Simulator, motion: Motion, cell_size: float) -> np.ndarray:
@@ -29,18 +29,18 @@ def first_pose(simulator: Simulator, motion: Motion, cell_size: float) -> np.nda
 
     Args:
         simulator: the world.
-        motion: of the robot, which must be able to take that view itself.
+        motion: of the robot, which must be able to take that view.
         cell_size: edge of a cell of the coarse grid [m].
 
     Raises:
         ValueError: a start outside the world's box, or at a height that the robot cannot reach;
             a world that cannot be explored (see `check_world`).
     """
-    # First: neither the search for a start nor the grid names the scale that would mend the mesh.
+    # First: the errors of the search for a start and of the grid do not suggest a scale.
     check_world(simulator.bounds, cell_size)
     pose = np.asarray(simulator.start_pose, dtype=np.float64)
     lower, upper = np.asarray(simulator.bounds, dtype=np.float64)
-    # The grid ends just beyond the box: outside it no cell is there to fly through.
+    # The grid ends just beyond the box: outside there are no cells.
     if not np.all((pose[:3, 3] >= lower) & (pose[:3, 3] <= upper)):
         raise InputError(
             f"the start position {pose[:3, 3].round(3).tolist()} lies outside the scene's box "
@@ -55,10 +55,10 @@ def check_world(bounds: np.ndarray, cell_size: float, setting: str = "--cell-siz
     Args:
         bounds: its box, [2, 3] [m].
         cell_size: edge of a cell of the coarse grid [m].
-        setting: where the user said so.
+        setting: name of the user's setting of it.
 
     Raises:
-        ValueError: says what is odd, and which scale would mend it.
+        ValueError: says what is wrong, and which scale would be right.
     """
     extent = np.ptp(np.asarray(bounds, np.float64), axis=0)
     size = f"the world is {' x '.join(f'{length:.6g}' for length in extent)} m large"
@@ -69,11 +69,11 @@ def check_world(bounds: np.ndarray, cell_size: float, setting: str = "--cell-siz
         if _LEAST_HOUSE <= scale * extent.max() <= _LARGEST_HOUSE
     ]
     hint = hints[0] if hints else ""
-    # Each check is written so that NaN fails it, too.
+    # Written as conditions that NaN fails, too.
     if not extent.max() >= _LEAST_EXTENT:
         raise InputError(f"{size}: too small for a camera with {_LEAST_EXTENT / 2:g} m free{hint}")
     if not extent.min() >= _LEAST_HEIGHT:
-        raise InputError(f"{size}: it is flat, there is no space to explore")
+        raise InputError(f"{size}: flat, with no space to explore")
     # The grid has a cell more on every side, as walls lie on the faces of the box.
     cells = float(np.prod(extent / cell_size + 2.0))
     if not cells <= MAX_CELLS:
@@ -84,31 +84,31 @@ def check_world(bounds: np.ndarray, cell_size: float, setting: str = "--cell-siz
 
 
 class OracleReadError(RuntimeError):
-    """An image was requested from where the camera is not."""
+    """An image was requested from another pose than the camera's."""
 
 
 class GuardedSimulator:
     """A `Simulator` that renders the poses of one run, each once and in order."""
 
     def __init__(self, simulator: Simulator, views: int = 0):
-        """Wraps `simulator`, which is reachable through the guard only from here on.
+        """Wraps `simulator`, which from now on is only accessible through the guard.
 
         Args:
             simulator: the world.
-            views: images of the run that were taken before, by a process that was killed.
+            views: number of images taken before, by an earlier process of the run.
         """
-        # In a closure: an attribute would hand the whole world to a policy that finds the guard.
+        # In a closure: an attribute would give a policy with the guard access to the world.
         render = simulator.render
 
         def render_committed(T_world_camera: np.ndarray) -> Frame:
             self._check(T_world_camera)
-            # Spent before the world renders: an image that fails is not requested again, either.
+            # Reset before rendering: an image that fails is not rendered again, either.
             self._pose = None
             self.views += 1
             return render(T_world_camera)
 
         self._render = render_committed
-        # Copies, here and below: who holds such an array cannot move the box or the start.
+        # Copies, here and below, so that callers cannot change the box or the start.
         self._camera, self._bounds = simulator.camera, np.array(simulator.bounds)
         self._start_pose = np.array(simulator.start_pose)
         self._pose: np.ndarray | None = None
@@ -133,7 +133,7 @@ class GuardedSimulator:
         """Marks the camera as arrived: the next image is taken from here.
 
         Args:
-            view: its number. Images are counted, so that none is taken behind the loop's back.
+            view: its number. Images are counted, to detect others taken outside the loop.
             T_world_camera: its pose, [4, 4].
 
         Raises:
@@ -142,7 +142,7 @@ class GuardedSimulator:
         if view != self.views:
             raise OracleReadError(
                 f"view {view} comes next, but {self.views} pictures were taken: something beside "
-                "the loop used the simulator"
+                "the loop has used the simulator"
             )
         self._pose = np.array(T_world_camera, dtype=np.float64)
 
@@ -158,10 +158,10 @@ class GuardedSimulator:
         pose = np.asarray(T_world_camera, dtype=np.float64)
         if self._pose is None:
             raise OracleReadError(
-                f"a picture from {_place(pose)} was requested while the camera is under way: only "
-                "the loop looks, once from each pose that was decided on"
+                f"a picture from {_place(pose)} was requested while the camera is moving: only "
+                "the loop renders, once at each chosen pose"
             )
-        # Exact: the loop renders the array it committed; a tolerance would let peeks through.
+        # Exact: the loop renders the array that it committed; a tolerance would allow other poses.
         if not np.array_equal(pose, self._pose):
             raise OracleReadError(
                 f"a picture from {_place(pose)} was requested, but the camera is at "

@@ -1,7 +1,7 @@
 """The exploration loop: step until the budget is spent, and record every view.
 
-A run that is interrupted, or whose disk is full, ends like any other: with the reason, and with
-everything recorded before complete. It goes on from there as if nothing had happened.
+An interrupted run, or one with a full disk, ends like any other: with a reason, and with a complete
+record of all earlier views. It can be resumed with the same result as without the interruption.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,10 +32,10 @@ from r3jax.simulators.base import Simulator
 
 @runtime_checkable
 class Recorder(Protocol):
-    """Writes a run while it is under way: `runs.writer.RunWriter` is one."""
+    """The interface for recording a run; implemented by `runs.writer.RunWriter`."""
 
     def record_view(self, view: TakenView, state: LoopState, config: ExplorationConfig) -> None:
-        """Writes one view, and begins to write the state after it.
+        """Writes one view, and starts writing the state after it.
 
         Raises:
             RecordingStopped: it cannot be written; the views before it are complete.
@@ -43,13 +43,13 @@ class Recorder(Protocol):
         ...
 
     def record_end(self, state: LoopState, stop: Stop) -> Stop:
-        """Writes the last state and how the run ended; returns the end with what failed in it."""
+        """Writes the last state and how the run ended; returns the end, with failures added."""
         ...
 
 
 @runtime_checkable
 class RecordedViews(Protocol):
-    """The views of a run that was cut off: `runs.reader.Run` has them."""
+    """The interface for the record of an interrupted run; implemented by `runs.reader.Run`."""
 
     @property
     def rows(self) -> Sequence[StepRow]:
@@ -61,7 +61,7 @@ class RecordedViews(Protocol):
         ...
 
     def newest_state(self, start: LoopState) -> LoopState:
-        """Returns the newest stored state that can be used, or `start` if there is none."""
+        """Returns the newest usable checkpoint, or `start` if there is none."""
         ...
 
 
@@ -92,35 +92,34 @@ def explore(
     """Explores an unknown scene until the budget is spent or no view is left.
 
     Args:
-        simulator: the world; it renders images from where the camera is, and nothing else.
-        policy: chooses the views.
+        simulator: the world, used only to render images at the camera's poses.
+        policy: the policy that chooses the views.
         budget: a limit, or its text such as `views:100`.
-        seed: all randomness follows from it: step k uses `fold_in(key, k)`.
+        seed: random seed; step k uses `fold_in(key, k)`.
         config: settings of the loop.
-        recorder: where the run is written; None keeps nothing.
-        resume: what was recorded of this run before it was cut off; None for a new run. Under
-            the model clock the result is the one of a run that was never cut off, bit for bit.
-        decided_from: the first of the recorded views that this policy chose. Of those before it
-            is shown the frames, but makes no decision.
-        is_enough: called every `config.until_every` views; the reason why no further view is needed
-            ends the run, None lets it go on. Must come with `config.until`, which records it.
-        on_view: called with every view once it is recorded, and with the planner that has seen it;
-            both may be kept, as they never change.
-        on_stage: called with the name of what happens next.
+        recorder: writes the run; None: nothing is written.
+        resume: the record of an interrupted run to resume; None for a new run. With the model clock
+            the result is bit-identical to that of an uninterrupted run.
+        decided_from: the first recorded view that this policy chose. For earlier views it gets the
+            frames, but makes no decisions.
+        is_enough: called every `config.until_every` views; returns the reason why no further view
+            is needed, which ends the run, or None. Requires `config.until`, which records it.
+        on_view: called with every recorded view and the planner after it; both are immutable.
+        on_stage: called with the name of each stage when it begins.
 
     Returns:
-        The last state, the rows, and why it ended. An interrupt (Ctrl-C) and a disk that
-        refuses to be written end the run too; what was recorded before is complete.
+        The last state, the rows, and why the run ended. An interrupt (Ctrl-C) or a full disk also
+        ends the run; the record of earlier views is complete.
 
     Raises:
-        ValueError: a budget that is not understood, a start outside the scene's box, a goal in the
-            config without an `is_enough` that judges it.
-        RunError: a recorded frame that is needed to go on is missing or broken.
-        PolicyError: a program that chooses the views has died, hangs, or answers nonsense.
-        OracleReadError: something beside the loop took an image from the simulator.
+        ValueError: an invalid budget, a start outside the scene's box, `config.until` without
+            `is_enough`.
+        RunError: a recorded frame that is needed to resume is missing or broken.
+        PolicyError: an external policy program has died, hangs, or sends invalid replies.
+        OracleReadError: an image was rendered outside the loop.
     """
     config = config or ExplorationConfig()
-    # run.json records the goal as text: a rule without it could not be repeated by a resume.
+    # run.json records the goal as text: without it the rule could not be resumed.
     if (config.until is None) != (is_enough is None):
         raise InputError(
             f"config.until is {config.until!r}, is_enough is "
@@ -128,10 +127,10 @@ def explore(
             "makes the one of the other"
         )
     budget = parse_budget(budget) if isinstance(budget, str) else budget
-    # Apart: how a policy starts must not change what it draws later.
+    # Separate keys: initializing a policy must not change its later random numbers.
     init_key, key = jax.random.split(jax.random.key(seed))
     mission = Mission(
-        # A resumed run reads its old images from the disk: the guard counts them as taken.
+        # A resumed run reads its earlier images from disk: the guard counts them as taken.
         GuardedSimulator(simulator, views=0 if resume is None else len(resume.rows)),
         policy,
         budget,
@@ -143,8 +142,8 @@ def explore(
     )
     rows: list[StepRow] = []
     try:
-        # Also for a resume: it gives the arrays of a checkpoint their structure, and is where to
-        # begin again if no checkpoint can be used.
+        # Also for a resumed run: it gives a checkpoint's arrays their structure, and is the
+        # fallback if no checkpoint can be used.
         state = start_state(mission, init_key)
         if resume is not None:
             state = _continued(resume, mission, state, decided_from=decided_from)
@@ -159,16 +158,16 @@ def explore(
 def _continued(
     run: RecordedViews, mission: Mission, start: LoopState, *, decided_from: int
 ) -> LoopState:
-    """Rebuilds the state after the last recorded view, from the newest stored state.
+    """Rebuilds the state after the last recorded view, from the newest checkpoint.
 
-    Rows and frames alone rebuild the state, from the first view if need be; a stored state saves
-    the time. So one that is missing, damaged or of another version costs time, not the run.
+    Rows and frames suffice to rebuild the state, if needed from the first view on; checkpoints save
+    time. So a checkpoint that is missing, damaged or of another version only costs time.
 
     Raises:
         RunError: a frame that is needed is missing, broken, or not the one that was recorded.
     """
-    # A stored state has neither the decision that was made while moving, nor the memory of an
-    # external program: all views are processed again.
+    # Checkpoints contain neither decisions made while moving nor the memory of external programs:
+    # all views are processed again.
     is_stored = not (mission.config.plan_while_moving or isinstance(mission.policy, LivesOutside))
     state = run.newest_state(start) if is_stored else start
     for row in run.rows[state.views :]:
@@ -185,32 +184,32 @@ def _go(
     recorder: Recorder | None,
     on_view: Callable[[TakenView, Planner], None],
 ) -> tuple[LoopState, Stop]:
-    """Steps until something ends the run; adds to `rows`, and records the end."""
+    """Steps until the run ends; appends to `rows`, and records the end."""
     try:
         stop: Stop | None = None
         while stop is None:
             after, output = step(state, mission)
             if isinstance(output, Stop):
-                # The state after a stop is dropped: with a larger budget a resume asks the policy
-                # again from the last view, as a run with that budget would have done.
+                # The state after a stop is dropped: when resumed with a larger budget, the policy
+                # decides again from the last view, as in a run with that budget.
                 stop = output
                 continue
             if recorder is not None:
                 mission.on_stage("record")
                 recorder.record_view(output, after, mission.config)
-            # Only once it is recorded: a disk that is full ends the run at what is on it.
+            # Only once it is recorded: with a full disk the run ends at the last recorded view.
             state = after
             rows.append(output.row)
             on_view(output, state.planner)
-    # The view under way is dropped; if its row is on the disk already, a resume finds it there.
+    # The current view is dropped; if its row is on disk already, it is used when resuming.
     except KeyboardInterrupt:
         stop = Stop(
             StopReason.INTERRUPTED, f"interrupted by the user after {describe_counts(rows)}"
         )
-    # Before `Exception`, of which it is one: a full disk ends a run without being its failure.
+    # Before `Exception`, its base class: a full disk ends a run, but is not a failure of it.
     except RecordingStopped as error:
         stop = Stop(StopReason.RECORDING_STOPPED, str(error))
-    # The record of a failure ends properly, too; the error itself goes on to the caller.
+    # The record of a failure ends properly, too; the error itself is raised to the caller.
     except Exception as error:
         if recorder is not None:
             failure = Stop(StopReason.FAILED, f"{type(error).__name__}: {error}")

@@ -1,4 +1,4 @@
-"""What a run carries from view to view, and what it leaves behind."""
+"""The state of a run, and how it ends."""
 
 import enum
 from collections.abc import Callable, Sequence
@@ -37,10 +37,10 @@ class StopReason(enum.Enum):
     """The policy found candidates, but no safe path to any of them."""
 
     SHUT_IN = "shut-in"
-    """The robot cannot leave its place: no path leads farther than a step."""
+    """The robot is shut in: no path leads farther than a step."""
 
     STUCK = "stuck"
-    """The policy has not moved for many views."""
+    """The policy is stuck: it has not moved for many views."""
 
     INTERRUPTED = "interrupted"
     """Ctrl-C."""
@@ -63,15 +63,15 @@ COMPLETE = frozenset(
         StopReason.STUCK,
     )
 )
-"""Ends that belong to the result; after any other an exploration is not over."""
+"""Reasons after which an exploration is complete; after any other it is not."""
 
 
 class RecordingStopped(PathError):
-    """A run folder refused a write in the middle of a run; everything before it stays readable."""
+    """A run folder could not be written during a run; all earlier views stay readable."""
 
 
 def describe_counts(rows: Sequence[StepRow]) -> str:
-    """Says how many views and how many frames captured while moving the rows of a run hold."""
+    """Describes the numbers of views and of frames captured while moving."""
     captured = sum(row.captured for row in rows)
     return _counts_of(len(rows) - captured, captured)
 
@@ -82,20 +82,20 @@ def _counts_of(chosen: int, captured: int) -> str:
 
 @dataclass(frozen=True)
 class PlannedAhead:
-    """A decision that is made while the camera flies, for when it arrives."""
+    """A decision made while the camera moves, for its arrival."""
 
     decision: Decision
-    """What the policy decided, on the map as it was expected to be."""
+    """The decision on the predicted map."""
 
     charge: float
-    """What it takes on the mission clock [s]."""
+    """Its cost on the mission clock [s]."""
 
     flight: float
-    """How long the camera flies meanwhile [s]."""
+    """Time of the flight meanwhile [s]."""
 
     @property
     def hidden(self) -> float:
-        """Part of the charge that the flight hides [s]."""
+        """Part of the cost that the flight hides [s]."""
         return min(self.charge, self.flight)
 
 
@@ -104,10 +104,10 @@ class LoopState:
     """Everything that the next step depends on."""
 
     views: int
-    """Frames in the map."""
+    """Number of frames in the map."""
 
     planner: Planner
-    """What is known, and what the policy remembers."""
+    """The planner."""
 
     T_world_camera: np.ndarray
     """Pose of the last view (before the first: the start pose), [4, 4] float64."""
@@ -122,25 +122,25 @@ class LoopState:
     """Angle turned [rad]."""
 
     still_views: int = 0
-    """Views in a row that were taken without moving."""
+    """Number of latest views in a row without moving."""
 
     captured: int = 0
-    """Frames in the map that were captured while moving."""
+    """Number of frames in the map captured while moving."""
 
     leg: Leg | None = None
-    """The path under way; None where a decision comes next."""
+    """The current path; None if a decision comes next."""
 
     planned: PlannedAhead | None = None
-    """The decision that comes next, as far as it was made while moving."""
+    """The next decision, if it was made while moving."""
 
     @property
     def chosen(self) -> int:
-        """Views that were chosen, and the one at the start."""
+        """Number of chosen views, including the initial one."""
         return self.views - self.captured
 
     @property
     def counts(self) -> str:
-        """Number of views, and of frames captured while moving where there are any, in words."""
+        """Numbers of views and of frames captured while moving, in words."""
         return _counts_of(self.chosen, self.captured)
 
     @property
@@ -155,7 +155,7 @@ class LoopState:
 
     @property
     def policy_state(self) -> Any:
-        """What the policy remembers."""
+        """The policy's memory."""
         return self.planner.policy_state
 
 
@@ -170,20 +170,20 @@ class Stop:
 
 @dataclass(frozen=True)
 class Mission:
-    """What stays the same over a run: `explore` makes it, `step` reads it."""
+    """Everything that is fixed during a run: made by `explore`, read by `step`."""
 
     simulator: GuardedSimulator
     policy: Policy
     budget: Budget
-    # Never advanced: every step folds its number in, so a resume needs none of its history.
+    # Never advanced: every step folds its number in, so that resuming needs no history.
     key: jax.Array
     config: ExplorationConfig
     clock: Clock
     is_enough: Callable[[LoopState], str | None] | None = None
-    """Called every `config.until_every` views: why no further view is needed, or None."""
+    """Called every `config.until_every` views; returns why no further view is needed, or None."""
 
     on_stage: Callable[[str], None] = lambda stage: None
-    """Told what happens next: `forecast`, `plan`, `gaze`, `render`, `map`, `measure`, `record`."""
+    """Called with each stage: `forecast`, `plan`, `gaze`, `render`, `map`, `measure`, `record`."""
 
     @property
     def rules(self) -> CaptureSettings:

@@ -1,8 +1,8 @@
-"""One step of the loop: decide, fly, look, map. On the host, round jitted parts.
+"""One step of the loop: decide, move, render, map.
 
-A step takes one frame: the view that was chosen, or one on the path to it if the settings ask for
-captures; without them only the frame at the end of a path enters the map. The time of the
-simulator and of the bookkeeping is not on the mission clock.
+On the host, around jitted parts. A step takes one frame: the chosen view, or one on the path to it
+if frames are captured while moving. The time of the simulator and of bookkeeping is not on the
+mission clock.
 """
 
 import time
@@ -46,8 +46,8 @@ def start_state(
 
     Args:
         mission: settings of the run.
-        init_key: of the policy's first state.
-        other_starts: poses [4, 4] where others start at the same time: space that is free, too.
+        init_key: key for the policy's initial memory.
+        other_starts: initial poses [4, 4] of other cameras, around which space is free, too.
 
     Raises:
         ValueError: see `guard.first_pose`.
@@ -68,30 +68,30 @@ def start_state(
 def step(
     state: LoopState, mission: Mission, *, exchange: float = 0.0
 ) -> tuple[LoopState, TakenView | Stop]:
-    """Takes one frame: decides where to go (not at the start), flies, captures and maps.
+    """Takes one frame: decides on a view (except at the start), moves, renders and maps.
 
-    While a path is under way nothing is decided: the next frame on it is taken.
+    During a path there is no decision: its next frame is taken.
 
     Args:
         state: before the frame.
         mission: settings of the run.
-        exchange: seconds on the mission clock that receiving frames of others took since the
-            last view.
+        exchange: time on the mission clock for receiving frames of other cameras since the last
+            view [s].
 
     Returns:
-        The state after the view and what to record; or, if the run ends here, the state as it
-        was and the reason.
+        The state after the view and its record; or, if the run ends, the unchanged state and the
+        reason.
     """
     charged = {"exchange": exchange} if exchange else {}
     if state.views == 0:
-        # Free of charge: the camera stands there already, and no policy chose the view.
+        # Free of charge: the camera is there already, and no policy chose the view.
         here = state.T_world_camera
         return _look(state, mission, here, None, {}, {"planning": 0.0} | charged)
     if state.leg is not None:
         return _next_frame(state, mission, state.leg, {}, {"planning": 0.0} | charged)
-    # Before deciding: a spent budget must not pay for a decision that cannot be carried out.
+    # Before deciding: with a spent budget the decision could not be carried out.
     stop = _spent(state, mission, seconds=exchange, metres=0.0)
-    # After the budget: a forecast takes most of a second, and a spent run needs none.
+    # After the budget: a forecast takes almost a second, and a finished run needs none.
     if stop is None:
         stop = _good_enough(state, mission)
     if stop is not None:
@@ -104,24 +104,24 @@ def step(
 
 
 class _Chosen(NamedTuple):
-    """A decision, and what it takes."""
+    """A decision and its costs."""
 
     decision: Decision | None
     planner: Planner
     info: PlanInfo
     charge: float
-    """Seconds on the mission clock."""
+    """Cost on the mission clock [s]."""
     hidden: float
-    """Seconds that the flight before hid."""
+    """Time hidden by the flight before [s]."""
     stages: dict[str, float]
-    """Seconds that it really took."""
+    """Measured time [s]."""
 
 
 def _choose(state: LoopState, mission: Mission) -> _Chosen:
-    """Decides where to go; a decision made while moving is reconsidered."""
+    """Chooses the next view; reconsiders a decision made while moving."""
     mission.on_stage("plan")
     clock, planned = mission.clock, state.planned
-    # By the number of the view, so that a resumed run draws what it would have drawn.
+    # By the number of the view, so that a resumed run draws the same numbers.
     key = jax.random.fold_in(mission.key, state.views)
     here, charge, hidden, stages = state.T_world_camera, 0.0, 0.0, dict[str, float]()
     if planned is not None:
@@ -147,7 +147,7 @@ def _depart(
     """Begins the path of a decision; with planning while moving, the next decision is made, too.
 
     Returns:
-        The state, the path, and the seconds that stages took so far.
+        The state, the path, and the times of the stages so far [s].
     """
     leg = begin_leg(decision, chosen.info, state.T_world_camera, mission.rules)
     leg = replace(leg, hidden=chosen.hidden)
@@ -159,10 +159,10 @@ def _depart(
 
 
 def _plan_ahead(state: LoopState, mission: Mission, leg: Leg) -> tuple[LoopState, float]:
-    """Decides for the end of a path in advance; returns the state, and the seconds it took.
+    """Makes the decision for the end of a path in advance; returns the state, and its time [s].
 
-    The decision takes the view at the end of the path as taken, and nothing of those captured
-    while moving: their directions are found later, from frame to frame.
+    It predicts the view at the end of the path, but not the frames captured while moving, whose
+    directions are only chosen later.
     """
     mission.on_stage("plan ahead")
     rules, clock = mission.rules, mission.clock
@@ -191,7 +191,7 @@ def _next_frame(
     stages: dict[str, float],
     before: dict[str, float],
 ) -> tuple[LoopState, TakenView | Stop]:
-    """Flies the next piece of a path and takes the frame at its end.
+    """Moves along the next piece of a path and takes the frame at its end.
 
     Args:
         state: before the frame.
@@ -241,13 +241,14 @@ def _spent(state: LoopState, mission: Mission, *, seconds: float, metres: float)
     # A policy that only turns spends no meters: such a budget alone would never end the run.
     if state.still_views >= mission.config.max_still_views:
         return Stop(
-            StopReason.STUCK, f"{spent}: the last {state.still_views} views were taken on one spot"
+            StopReason.STUCK,
+            f"{spent}: the last {state.still_views} views are from one position",
         )
     return None
 
 
 def _good_enough(state: LoopState, mission: Mission) -> Stop | None:
-    """Returns the stop reason if the goal is reached; the mission clock does not count it."""
+    """Returns the stop reason if the goal is reached; not on the mission clock."""
     if mission.is_enough is None or state.chosen % mission.config.until_every:
         return None
     mission.on_stage("forecast")
@@ -263,7 +264,7 @@ def _look(
     stages: dict[str, float],
     before: dict[str, float],
 ) -> tuple[LoopState, TakenView]:
-    """Takes a frame, integrates it and measures what is known now.
+    """Takes a frame, integrates it and measures the coverage.
 
     Args:
         state: before the frame.
@@ -279,9 +280,9 @@ def _look(
     mission.on_stage("render")
     begin = time.perf_counter()
     frame = _render(mission, state.views, T_world_camera)
-    # Read here: what follows is bookkeeping, which the simulator must not be blamed for.
+    # Read here: what follows is bookkeeping, not time of the simulator.
     stages = stages | {"render": time.perf_counter() - begin}
-    # Of the map before the frame: what had been promised of this view.
+    # On the map before the frame, for which the view was chosen.
     arrival = view_renderability(state.map_state, frame.camera, frame.T_world_camera)
 
     mission.on_stage("map")
@@ -309,7 +310,7 @@ def _look(
     )
     row = StepRow(
         step=state.views - 1,
-        # The frame's float32, not the pose of the decision: a replay has no other pose.
+        # The frame's float32 pose, not that of the decision, as in a replay.
         pose=np.asarray(frame.T_world_camera),
         sha256=frame_hash(frame),
         choice=make_choice(decided.decision, decided.info) if decided else None,
@@ -327,12 +328,12 @@ def _look(
 
 def _render(mission: Mission, view: int, T_world_camera: np.ndarray) -> Frame:
     """Takes the image of a view, in stored form."""
-    # Rounded as the trace has it: the image is taken from the very pose that is recorded, so that
-    # poses alone give the images again.
+    # Rounded as in the trace: the image is taken at exactly the recorded pose, so that poses
+    # suffice to render the images again.
     pose = np.asarray(T_world_camera, dtype=np.float32).astype(np.float64)
-    # Announced first, so that an image that the loop did not choose is noticed.
+    # Committed first, so that other images are detected.
     mission.simulator.commit(view, pose)
-    # Rounded as it will be on disk before the map sees it: a replay integrates the same bits.
+    # Rounded as on disk before it enters the map, so that a replay integrates the same bits.
     return stored_form(mission.simulator.render(pose))
 
 
@@ -344,20 +345,21 @@ def relive(
     Args:
         state: before the frame.
         mission: settings of the run.
-        row: what the trace says of it.
-        frame: its frame, read back.
-        decides: ask the policy again, for what it remembers of its decision. Policies are pure:
-            the same state and key give the same decision. False for a policy that did not
-            choose this view: it is given the path.
+        row: its row in the trace.
+
+        frame: the frame, read back.
+        decides: let the policy decide again, to restore its memory. Policies are pure: the same
+            state and key give the same decision. False if the policy did not choose this view: it
+            only gets the path.
 
     Returns:
-        The state after the frame, and the policy's decision where it made one.
+        The state after the frame, and the policy's decision, if it made one.
     """
     leg, decision = state.leg, None
     if row.choice is not None:
         if decides:
-            # Of the decision only its memory is used: the row knows pose and seconds, and one
-            # that is timed again would put other seconds on the mission clock.
+            # Only the memory after the decision is used: pose and times are in the row, and
+            # measuring again would change the mission clock.
             chosen = _choose(state, mission)
             decision = chosen.decision
             if decision is None:
@@ -373,7 +375,7 @@ def relive(
         length = row.choice.length
         metres = state.metres + length
     state = _arrive(state, planner, frame, length, row.charged, captured=row.captured)
-    # A path ends with the view that was chosen, whatever became of it.
+    # A path ends with the chosen view.
     leg = leg.after if leg is not None and row.captured else None
     return replace(state, metres=metres, leg=leg), decision
 
@@ -389,8 +391,7 @@ def _arrive(
 ) -> LoopState:
     """Adds one frame: the pose is the frame's, and the totals include the path to it.
 
-    The recorded pose (float32) is the pose from here on, so that a run that was read back goes on
-    identically.
+    The recorded pose (float32) is used from here on, so that a resumed run is identical.
     """
     pose = np.asarray(frame.T_world_camera, dtype=np.float64)
     return replace(
@@ -399,10 +400,10 @@ def _arrive(
         views=state.views + 1,
         captured=state.captured + captured,
         T_world_camera=pose,
-        # One sum per view, as when it was flown: `_agrees` compares the clock bit by bit.
+        # One sum per view, as in the original run: `_agrees` compares the clock bit by bit.
         seconds=state.seconds + sum(charged.values()),
         metres=state.metres + length,
         radians=state.radians + angle_between(state.T_world_camera, pose),
-        # Below a centimeter a path is rounding: turning on the spot does not count as moving.
+        # Paths below a centimeter are rounding: turning in place does not count as moving.
         still_views=state.still_views + 1 if length < 0.01 else 0,
     )

@@ -1,8 +1,8 @@
-"""Views that were taken: the stored form of a frame, and the row that is recorded of it.
+"""Taken views: the stored form of a frame, and its row in the trace.
 
-The map integrates what is recorded: the loop rounds a frame to its stored form (8-bit color,
-16-bit depth) *before* it enters the map, so that a map rebuilt from the files is the same map,
-bit for bit.
+The map integrates what is recorded: the loop rounds a frame to its stored form (8-bit color, 16-bit
+depth) *before* it enters the map, so that a map rebuilt from the files is the same map, bit for
+bit.
 
 Shape symbols: H, W image size; K waypoints.
 """
@@ -21,7 +21,7 @@ from r3jax.geometry.cameras import Camera
 from r3jax.planning.policy import Decision, PlanInfo
 
 TOP_CANDIDATES = 10
-"""Candidates of a decision that a row keeps, the best ones by total utility."""
+"""Number of candidates of a decision kept in a row: the best by total utility."""
 
 
 @dataclass(frozen=True)
@@ -41,51 +41,51 @@ class Choice:
     """Length of that path [m]."""
 
     num_candidates: int
-    """Poses that were drawn."""
+    """Number of poses drawn."""
 
     num_reachable: int
-    """Poses that a safe path leads to."""
+    """Number of reachable poses."""
 
     top: dict[str, list[float | None]] = field(default_factory=dict[str, list[float | None]])
-    """Utilities of the best candidates, best first; None where one has no finite value."""
+    """Utilities of the best candidates, best first; None for values that are not finite."""
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """What the map and the grid know after a view. Not on the mission clock."""
+    """Coverage of map and grid after a view. Not on the mission clock."""
 
     voxels: int
-    """Occupied voxels of the map."""
+    """Number of voxels in the map."""
 
     map_bytes: int
-    """Memory of the map's rows, empty ones included [bytes]."""
+    """Memory of the map's rows, including empty ones [bytes]."""
 
     dropped: int
-    """Observations lost so far because the table was full and might not grow."""
+    """Number of observations dropped so far because the table was full and could not grow."""
 
     known_cells: int
-    """Coarse cells known to be free or occupied."""
+    """Number of coarse cells known to be free or occupied."""
 
     known_share: float
-    """Known cells over all cells of the scene's box. The insides of walls and of furniture and
-    what lies outside can never be seen, so it stays below 1."""
+    """Share of known cells of the scene's box. The insides of walls and furniture and the outside
+    can never be seen, so it stays below 1."""
 
     frontier_cells: int
-    """Unexplored cells that share a face with a free one: what is left to see."""
+    """Number of unexplored cells next to a free one."""
 
     mean_renderability: float
     """Mean renderability of a fixed sequence of probe views inside known free space."""
 
     arrival_renderability: float
-    """Renderability of this very view just before it was integrated: how much it repeated."""
+    """Renderability of this view just before it was integrated; high if it repeats others."""
 
 
 @dataclass(frozen=True)
 class StepRow:
-    """One view: where, why, at what cost, and what is known since."""
+    """The record of one view: its pose, its choice, its cost, and the coverage after it."""
 
     step: int
-    """Number of the view, from 0; names its images."""
+    """Number of the view, from 0, also in the names of its images."""
 
     pose: np.ndarray
     """`T_world_camera`, [4, 4] float32."""
@@ -94,9 +94,9 @@ class StepRow:
     """Hash of the stored pixels."""
 
     choice: Choice | None
-    """How the view was chosen; None for the start pose. Where frames are captured while moving, the
-    decision stands in the first row of its path: what comes before a row is what was known when it
-    was made."""
+    """How the view was chosen; None for the start pose. If frames are captured while moving, the
+    decision is in the first row of its path, so that the rows before it are those on which it was
+    made."""
 
     seconds: float
     """Mission clock after the view: planning, mapping and flight [s]."""
@@ -108,26 +108,27 @@ class StepRow:
     """Angle turned so far, along the shortest rotations [rad]."""
 
     charged: dict[str, float]
-    """What this view added to the mission clock: `planning`, `mapping`, `flight`, `gaze` where it
-    was captured while moving, and `exchange` where others told what they had seen [s]."""
+    """Time that this view added to the mission clock, by stage: `planning`, `mapping`, `flight`,
+    `gaze` if it was captured while moving, and `exchange` if frames of other cameras were received
+    [s]."""
 
     coverage: Coverage
 
     captured: bool = False
-    """True if the frame was captured while moving to a view, and not chosen itself."""
+    """True if the frame was captured while moving."""
 
     hidden: float = 0.0
-    """Planning of this row's decision that the flight before it hid: not on the clock [s]."""
+    """Planning time of this row's decision hidden by the flight before it; not on the clock [s]."""
 
     @property
     def begins_run(self) -> bool:
-        """True if the camera did not fly to the view: a run begins, be it within a merged one."""
+        """True for the first view of a run, also within a merged run."""
         flown = self.choice is not None or self.captured or self.charged.get("flight", 0.0) > 0.0
         return not flown
 
 
 def unit_of(rows: Iterable[StepRow]) -> str:
-    """Names what rows count: views, or frames where some were captured while moving."""
+    """Returns the unit of rows: views, or frames if some were captured while moving."""
     return "frames" if any(row.captured for row in rows) else "views"
 
 
@@ -138,22 +139,21 @@ def name_of(row: StepRow, rows: Iterable[StepRow]) -> str:
 
 @dataclass(frozen=True)
 class TakenView:
-    """A view that was taken: what to record beside the state."""
+    """A taken view: everything to record beside the state."""
 
     row: StepRow
     frame: Frame
     """In stored form."""
 
     stages: dict[str, float] = field(default_factory=dict[str, float])
-    """Seconds that the stages really took, those off the mission clock included."""
+    """Measured times of the stages, including those not on the mission clock [s]."""
 
     decision: Decision | None = None
-    """What sent the camera here, with all that was on offer; None: nothing was decided since the
-    frame before."""
+    """The decision that led here, with all candidates; None: no decision since the frame before."""
 
 
 def make_choice(decision: Decision, info: PlanInfo) -> Choice:
-    """Makes the record of a decision for the trace."""
+    """Makes the record of a decision."""
     total = np.asarray(decision.utilities.get("total", np.zeros(0)), dtype=np.float64)
     # Unreachable candidates have no utility; stable, so that equal ones keep the order of drawing.
     best = np.argsort(-np.where(np.isfinite(total), total, -np.inf), kind="stable")
@@ -182,7 +182,7 @@ def to_integers(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     """Converts a frame to color [H, W, 3] uint8 and depth [H, W] uint16 in steps of 0.2 mm."""
     rgb = np.rint(np.asarray(frame.rgb) * np.float32(255.0)).astype(np.uint8)
     depth = np.asarray(frame.depth)
-    # inf times a number is inf, and its integer is undefined: it gets its own value below.
+    # inf has no integer: it gets its own value below.
     finite = np.where(np.isfinite(depth), depth, 0.0)
     # In float64 the product is exact; float32 would round it once more, before `rint` does.
     steps = np.rint(finite.astype(np.float64) * DEPTH_STEPS_PER_METRE)
@@ -195,7 +195,7 @@ def to_integers(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
 def from_integers(
     rgb: np.ndarray, depth: np.ndarray, T_world_camera: np.ndarray, camera: Camera
 ) -> Frame:
-    """Makes the frame that stored images represent: the inverse of `to_integers`."""
+    """Makes a frame from stored images: the inverse of `to_integers`."""
     metres = depth.astype(np.float32) / np.float32(DEPTH_STEPS_PER_METRE)
     return Frame(
         rgb=jnp.asarray(rgb.astype(np.float32) / np.float32(255.0)),
