@@ -34,13 +34,13 @@ class FrameReport:
     index: int
 
     renderability: float
-    """Mean over the frame's view, from the map before the frame joined it."""
+    """Renderability of the frame's view, on the map before the frame."""
 
     new_voxels: int
-    """Voxels that the frame added."""
+    """Number of voxels that the frame added."""
 
     voxels: int
-    """Voxels of the map afterwards."""
+    """Number of voxels in the map after the frame."""
 
     metres: float
     """Path of the camera so far [m]."""
@@ -49,10 +49,10 @@ class FrameReport:
 def follow_recording(
     recording: PosedImages, *, voxel_size: float = 0.05, max_range: float = 5.0
 ) -> Iterator[tuple[FrameReport, MapState]]:
-    """Integrates a recording and says of each frame how well it was known before.
+    """Integrates a recording and reports the renderability of each frame before it is mapped.
 
     Args:
-        recording: what to follow.
+        recording: the recording.
         voxel_size: edge of a voxel [m].
         max_range: depth beyond it is ignored [m].
 
@@ -60,7 +60,7 @@ def follow_recording(
         The report of a frame, and the map after it.
 
     Raises:
-        ValueError: voxels that are no size, or larger than a fifth of the range.
+        ValueError: an invalid voxel size, or one above a fifth of the range.
     """
     check_voxel_size(voxel_size, max_range)
     score = jax.jit(renderability)
@@ -152,14 +152,14 @@ def progress_figure(run: Run) -> Figure:
         below.set_ylim(0.0, 1.0)
     axes[0, 0].set_title(f"Against {unit}", fontsize=11, loc="left", fontweight="bold")
     axes[0, 1].set_title("Against time", fontsize=11, loc="left", fontweight="bold")
-    # Below the axes: anywhere inside, it covers the curves of some run.
+    # Below the axes: inside, it would cover the curves of some runs.
     figure.legend(*axes[1, 0].get_legend_handles_labels(), fontsize=8, frameon=False, ncols=2,
                   loc="outside lower center")  # fmt: skip
     return figure
 
 
 def plan_figure(run: Run, map_state: MapState, grid: OccupancyGrid) -> Figure:
-    """Draws the place from above, with the path colored by acquisition order."""
+    """Draws the scene from above, with the path colored by acquisition order."""
     positions = np.array([row.pose[:3, 3] for row in run.rows])
     picture, extent = floor_picture(map_state, grid, float(np.median(positions[:, 2])))
     width, height = extent[1] - extent[0], extent[3] - extent[2]
@@ -204,7 +204,7 @@ def _draw_path(axes: Axes, rows: Sequence[StepRow]) -> None:
 
 
 def _draw_views(axes: Axes, rows: Sequence[StepRow]) -> PathCollection:
-    """Draws where frames were taken, smaller while moving, and where the camera looked."""
+    """Draws positions (smaller for frames captured while moving) and viewing directions."""
     x, y, _ = np.array([row.pose[:3, 3] for row in rows]).T
     u, v, _ = np.array([row.pose[:3, 2] for row in rows]).T
     order, (low, high) = np.arange(len(rows)), _span(rows)
@@ -264,7 +264,7 @@ def cost_figure(run: Run) -> Figure:
     right.plot(views, used, color=style.ACCENT, linewidth=2.0, label="rows in use")
     right.step(views, allocated, color=style.SECOND, where="post", label="allocated")
     right.set_ylim(0.0, 1.15 * allocated.max())
-    # Below the axes: inside it covers a curve, above them the title.
+    # Below the axes: inside it would cover a curve, above them the title.
     handles = right.get_legend_handles_labels()
     figure.legend(*handles, fontsize=8, frameon=False, ncols=2, loc="outside lower right")
     return figure
@@ -313,16 +313,16 @@ def outlook_lines(outlook: Outlook) -> list[str]:
     """Describes the last forecast, and the views that one more decibel would take, a line each."""
     last = outlook.forecasts[-1]
     if not last.mixture.size:
-        return ["No view of free space can be named yet, so nothing is forecast."]
+        return ["No free space is known yet, so there is no forecast."]
     lines: list[str] = []
     for name, label in _SHOWN:
         low, high = last.interval(name, LEVEL)
         line = f"{label} ({name}): {last.value(name):.1f} dB ({low:.1f} to {high:.1f})"
         more = outlook.more_views(name)
         if more is not None:
-            line += f"; about {more} more views for +1 dB, as things went"
+            line += f"; about {more} more views for +1 dB at the recent rate"
         elif len(outlook.forecasts) > 1:
-            line += "; the last views added next to nothing to it"
+            line += "; the last views added almost nothing"
         lines.append(line)
     return lines
 
@@ -334,7 +334,7 @@ _MANY = 60
 def utility_by_cause(
     run: Run, states: Iterable[tuple[MapState, OccupancyGrid]] | None = None
 ) -> np.ndarray:
-    """Computes the utility that each view of a run promised when it was chosen, by cause.
+    """Computes the predicted utility of each view of a run when it was chosen, by cause.
 
     Args:
         run: the run.
@@ -354,7 +354,7 @@ def utility_by_cause(
 def shares_of(utility: np.ndarray) -> np.ndarray:
     """Divides each view's utility by its total, [views, 4].
 
-    The shares are 0 where the view promised nothing, and NaN where that is not known.
+    The shares are 0 if the utility is 0, and NaN if it is not known.
     """
     total = utility.sum(axis=1, keepdims=True)
     return np.where(total == 0.0, 0.0, utility / np.where(total == 0.0, 1.0, total))
@@ -375,7 +375,7 @@ def reasons_figure(utility: np.ndarray) -> Figure:
     views = np.arange(1, len(utility) + 1)
     percent = 100.0 * np.nan_to_num(shares_of(utility))
     width = 1.0 if len(views) >= _MANY else 0.86
-    style.dress(upper, "What each view was chosen for", y="share of its utility [%]")
+    style.dress(upper, "Causes of the utility of each chosen view", y="share of its utility [%]")
     base = np.zeros(len(views))
     for name, color, height in zip(CAUSES, style.CAUSE_COLORS, percent.T, strict=True):
         upper.bar(views, height, width, bottom=base, color=color, label=name, linewidth=0)
@@ -386,7 +386,7 @@ def reasons_figure(utility: np.ndarray) -> Figure:
         *upper.get_legend_handles_labels(), fontsize=9, frameon=False, ncols=4,
         loc="outside lower center",
     )  # fmt: skip
-    style.dress(lower, "What it promised", "chosen views, in order", "part of its utility U")
+    style.dress(lower, "Predicted utility", "chosen views, in order", "part of its utility U")
     lower.set_yscale("log")
     for color, amount in zip(
         style.CAUSE_COLORS, np.where(utility > 0.0, utility, np.nan).T, strict=True

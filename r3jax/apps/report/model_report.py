@@ -1,4 +1,4 @@
-"""What the report of a run says about the model that was trained on it."""
+"""The part of a run's report about the model trained on it."""
 
 import csv
 import hashlib
@@ -24,7 +24,7 @@ _TITLES = {
     "lpips": ("LPIPS", 3),
 }
 _TAIL = {"lpips": " (95th)"}
-"""The percentile of the worst views, where it is not the fifth."""
+"""The percentile of the worst views, if it is not the fifth."""
 
 _MAX_BYTES = 64 << 20
 
@@ -35,7 +35,7 @@ _KINDS = {
     "trained_on": int | None,
     **dict.fromkeys(("gaussians", "width", "height"), int),
 }
-"""What is used of evaluation.json."""
+"""The fields used of evaluation.json."""
 
 _PARTS = {
     **dict.fromkeys(("mean", "median", "percentile_5", "worst"), float),
@@ -43,13 +43,13 @@ _PARTS = {
     "worst_view": int,
     "poor_share": float | None,
 }
-"""What is used of one metric."""
+"""The fields used of one metric."""
 
 _COLUMNS = ("step", "loss", "psnr", "gaussians")
 """Columns of history.csv."""
 
 _LARGEST = 1e12
-"""No axis of a figure goes further."""
+"""Limit of the axes of figures."""
 
 _SMOOTHING = 50
 """Steps over which the curves are averaged: single views differ by many dB."""
@@ -57,7 +57,7 @@ _SMOOTHING = 50
 
 @dataclass(frozen=True)
 class EvaluatedModel:
-    """The newest evaluation of a model of a run, as it lies on disk."""
+    """The newest evaluation of a model of a run, as stored on disk."""
 
     evaluation: dict[str, Any]
     """evaluation.json."""
@@ -97,7 +97,7 @@ def read_evaluated_model(run: Run) -> EvaluatedModel | None:
 
 
 def _check(evaluation: Any) -> None:
-    """Refuses what the table and the note could not show.
+    """Refuses fields that the table or the note could not show.
 
     Raises:
         ForeignFileError: says what is missing or of another type.
@@ -129,18 +129,18 @@ def _read_columns(path: Path) -> dict[str, np.ndarray]:
     except (KeyError, TypeError):
         raise ForeignFileError(f"{path} must have the columns {', '.join(_COLUMNS)}") from None
     if not all((np.abs(column) <= _LARGEST).all() for column in columns.values()):
-        raise ForeignFileError(f"{path} holds a value that is not finite, or far out of range")
+        raise ForeignFileError(f"{path} contains a value that is not finite, or far out of range")
     return columns if rows else {}
 
 
 def _check_hash(path: Path, data: bytes, sha256: str | None) -> None:
-    """Refuses a file whose hash is not the one kept of it; earlier versions kept none.
+    """Refuses a file that does not match its stored hash; earlier versions stored none.
 
     Raises:
         ForeignFileError: says which.
     """
     if sha256 not in (None, hashlib.sha256(data).hexdigest()):
-        raise ForeignFileError(f"{path} is damaged: its SHA-256 is not the one kept")
+        raise ForeignFileError(f"{path} is damaged: it does not match its stored SHA-256")
 
 
 def training_figure(history: dict[str, np.ndarray]) -> Figure:
@@ -188,7 +188,7 @@ def quality_note(evaluation: dict[str, Any]) -> str:
     if trained_on == 0:
         which = f"{count} views that the model was not trained on"
     elif trained_on is None:
-        which = f"{count} views; it is not known whether the model was trained on them"
+        which = f"{count} views (not known whether the model was trained on them)"
     else:
         which = f"{count} views, {trained_on} of which the model was trained on"
     return (

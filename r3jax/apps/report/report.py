@@ -57,8 +57,8 @@ HINTS = {
     "p50": "Median over the steps of the run.",
     "p95": "95 % of the steps took less.",
     "total": "Sum over the run.",
-    "budget": "At which the run ends.",
-    "seed": "Determines all random numbers of the run.",
+    "budget": "Limit at which the run ends.",
+    "seed": "Random seed of the run.",
     "mission": "Time on the mission clock, see above.",
     "map": "Voxels with at least one measurement, and the memory of their table.",
     "dropped observations": "Measurements that did not fit into the map; 0 is as it should be.",
@@ -83,7 +83,7 @@ def write_report(
         run: the run, finished or cut off.
         map_state: its map after the last view.
         grid: its coarse grid after the last view.
-        on_progress: for a progress bar; a long run is looked back at for minutes.
+        on_progress: for a progress bar; a long run takes minutes to explain.
 
     Returns:
         The HTML page; the images are inside it, so it can be sent as one file.
@@ -93,7 +93,7 @@ def write_report(
         OSError: the disk is full, not writable, ...
     """
     if not run.rows:
-        raise RunError(run.path, "the run has no view, so there is nothing to report")
+        raise RunError(run.path, "the run has no views: nothing to report")
     last = run.rows[-1]
     max_range = float(run.header.config.get("max_range", 5.0))
     panorama = panorama_picture(map_state, grid, run.camera, last.pose, max_range)
@@ -142,11 +142,13 @@ def _saved(path: Path, figure: Figure) -> bytes:
 
 
 def _reasons(run: Run, outlook: Outlook, on_progress: Progress) -> Figure | str:
-    """Draws why the views were chosen, or says why that is not known.
+    """Draws why the views were chosen, or explains why that is not known.
 
-    The outlook receives the same maps.
+    The forecast uses the same maps.
     """
-    on_progress("looking back at the views", len(run.rows) - 1)  # nothing was chosen after the last
+    on_progress(
+        "looking back at the views", len(run.rows) - 1
+    )  # no view was chosen after the last one
     states = outlook.watch(_counted(states_of(run), on_progress))
     try:
         return reasons_figure(utility_by_cause(run, states))
@@ -198,7 +200,7 @@ def _cards(run: Run, model: EvaluatedModel | None) -> dict[str, str]:
 
 
 def _settings(run: Run) -> dict[str, str]:
-    """Returns the outcome, the totals and every setting, so that the page explains itself."""
+    """Returns the outcome, the totals and every setting."""
     header = run.header
     return {
         **summary(run),

@@ -24,8 +24,8 @@ STAGES = {
     "record": "writing to disk",
     "measure": "coverage numbers",
 }
-"""Stages of timings.jsonl in the order of a table, and how a reader calls them; older runs have
-mapping in three parts."""
+"""Stages of timings.jsonl in the order of the table, with their displayed names; older runs split
+mapping into three parts."""
 
 ON_CLOCK = (
     "plan",
@@ -37,12 +37,12 @@ ON_CLOCK = (
     "map.grid",
     "map.policy",
 )
-"""Stages that the mission clock charges (beside the flight)."""
+"""Stages that count on the mission clock (beside the flight)."""
 
 
 @dataclass(frozen=True)
 class StageTime:
-    """How long one stage took, over the views of a run."""
+    """Times of one stage over the views of a run."""
 
     name: str
     on_clock: bool
@@ -57,7 +57,7 @@ class StageTime:
 
 
 def stage_times(run: Run) -> list[StageTime]:
-    """Computes the step times by stage, as measured; stages that never ran are left out."""
+    """Computes the measured times by stage; stages that never ran are left out."""
     table: list[StageTime] = []
     known = [*STAGES, *sorted({k for t in run.timings for k in t} - {"step", *STAGES})]
     for key in known:
@@ -78,7 +78,7 @@ def count_of_views(run: Run) -> str:
 
 
 def outcome(run: Run) -> str:
-    """Tells how a run ended; of a budget that is used up, what it was and what was done with it."""
+    """Describes how a run ended; for a spent budget, with its amount."""
     if run.end is None or run.end.outcome != StopReason.BUDGET.value:
         return run.outcome
     spent = run.end.message.partition(": ")[0]

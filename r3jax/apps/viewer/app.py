@@ -1,6 +1,6 @@
-"""What the viewer does: the user's settings and drags become questions, answers go on the page.
+"""The logic of the viewer: settings and drags become queries, whose results are shown on the page.
 
-One thread answers the newest question, and never shows the answer to an older one.
+One thread computes the newest query, and results of older ones are never shown.
 """
 
 import functools
@@ -27,11 +27,11 @@ Answer = TypeVar("Answer")
 
 
 class LatestWorker(Generic[Question, Answer]):
-    """Answers questions one at a time, in a thread of its own. The last one asked wins.
+    """Computes queries one at a time, in its own thread; the latest query wins.
 
-    An answer may come in parts, the quick ones first. A question that is replaced while it waits
-    is never worked on; of one that is replaced while it is worked on, no further part is worked
-    out and none is shown. So whatever is shown belongs to the question that was asked last.
+    A result may come in parts, the quick ones first. A query that is replaced while it waits is
+    never computed; if it is replaced during its computation, no further part is computed or shown.
+    So everything shown belongs to the latest query.
     """
 
     def __init__(
@@ -46,12 +46,12 @@ class LatestWorker(Generic[Question, Answer]):
         """Starts the thread.
 
         Args:
-            answer: the work, part by part; called without a lock.
-            show: told each part of the answer to the newest question. A question asked meanwhile
-                waits until it returns, so it should be quick; it may ask itself.
-            fail: told what `answer` raised, on the same terms.
-            quiet: a question is taken up when none has followed it for so long [s].
-            idle: called again and again while nothing is asked, until it returns False.
+            answer: computes the parts of a result; called without a lock.
+            show: called with each part of the newest query's result. A new query waits until it
+                returns, so that it should be quick; it may submit queries itself.
+            fail: called in the same way with an error raised by `answer`.
+            quiet: a query starts when no other has followed for this time [s].
+            idle: called repeatedly without a query, until it returns False.
         """
         self._answer, self._show, self._fail = answer, show, fail
         self._quiet, self._idle = quiet, idle
@@ -63,12 +63,12 @@ class LatestWorker(Generic[Question, Answer]):
         self._thread.start()
 
     def ask(self, question: Question, mark: Callable[[], None] | None = None) -> None:
-        """Replaces the question that waits or is being worked on, if any.
+        """Replaces the query that is waiting or being computed, if any.
 
         Args:
-            question: the new one.
-            mark: called at once: after it, nothing of an earlier answer is shown any more, and
-                nothing of this one's has been shown yet.
+            question: the new query.
+            mark: called immediately; from then on no earlier result is shown, and nothing of the
+                new one has been shown yet.
         """
         with self._changed:
             if mark is not None:
@@ -78,12 +78,12 @@ class LatestWorker(Generic[Question, Answer]):
             self._changed.notify_all()
 
     def wait(self, timeout: float) -> bool:
-        """Waits until the newest question is answered; returns False after a timeout [s]."""
+        """Waits until the newest query is done; returns False after a timeout [s]."""
         with self._changed:
             return self._changed.wait_for(lambda: self._done == self._asked, timeout)
 
     def close(self) -> None:
-        """Ends the thread, after the work that it is at."""
+        """Ends the thread, after its current computation."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -96,7 +96,7 @@ class LatestWorker(Generic[Question, Answer]):
                 for part in self._answer(question):
                     if not self._tell(number, functools.partial(self._show, question, part)):
                         break
-            except Exception as error:  # shown, wherever it came from; the thread must live on
+            except Exception as error:  # shown, whatever it is; the thread must continue
                 self._tell(number, functools.partial(self._fail, question, error))
             with self._changed:
                 if number == self._asked:
@@ -104,7 +104,7 @@ class LatestWorker(Generic[Question, Answer]):
                 self._changed.notify_all()
 
     def _take(self) -> tuple[int, Question] | None:
-        """Waits for a question, and until it is the last one for a while; None: closed."""
+        """Waits for a query, and until none has followed for a while; None: closed."""
         while True:
             with self._changed:
                 if self._closed:
@@ -118,9 +118,9 @@ class LatestWorker(Generic[Question, Answer]):
                 self._idle = None
 
     def _settled(self) -> tuple[int, Question] | None:
-        """Waits until no question has followed the newest for a while; the lock is held.
+        """Waits until no query has followed the newest for a while; the lock is held.
 
-        Returns None if there is no question, or the worker is closed.
+        Returns None if there is no query, or the worker is closed.
         """
         newest = -1
         while newest != self._asked and not self._closed:
@@ -133,7 +133,7 @@ class LatestWorker(Generic[Question, Answer]):
         return self._closed or self._asked != number
 
     def _tell(self, number: int, tell: Callable[[], None]) -> bool:
-        """Reports the result; returns False if there is a newer question."""
+        """Reports the result; returns False if there is a newer query."""
         with self._changed:
             is_newest = number == self._asked and not self._closed
             if is_newest:
@@ -145,7 +145,7 @@ _THUMBNAIL = 64
 """Width of the pictures in the frusta along the path [px]."""
 
 _QUIET = 0.03
-"""A drag is answered when it has paused for so long [s]; browsers tell of it every 50 ms."""
+"""A drag is computed after a pause of this length [s]; browsers report it every 50 ms."""
 
 
 class App:
@@ -162,16 +162,18 @@ class App:
         subtitle: str,
         extras: Extras | None = None,
     ):
-        """Fills the page and starts to answer.
+        """Fills the page and starts the worker.
 
         Args:
-            server: with an empty page; it stays the caller's.
-            story: what to show; one that is live may have no view yet.
+            server: with an empty page; owned by the caller.
+            story: the story; a live one may have no view yet.
             config: of the scores.
             bounds: of the scene, [2, 3] [m].
-            title: what it is.
-            subtitle: more about it.
-            extras: what else is known.
+            title: of the page.
+
+            subtitle: below the title.
+
+            extras: further data to show.
         """
         extras = extras or Extras()
         self.story = story
@@ -196,7 +198,7 @@ class App:
         )
         low, high = np.asarray(bounds, np.float64)
         self.canvas.place_eye(low, np.minimum(high, [*high[:2], heights[2]]), PANEL_WIDTH)
-        if story.is_live:  # those of a recorded run take seconds, and come later
+        if story.is_live:  # for a recorded run they take seconds, and come later
             self._add_views()
         if story.rows:
             self.canvas.place_camera(np.asarray(story.rows[-1].pose, np.float64))
@@ -208,16 +210,16 @@ class App:
 
     @property
     def look(self) -> CameraPreview | None:
-        """What stands beside the dragged camera; None while it is worked out."""
+        """Numbers for the dragged camera; None while they are computed."""
         return self._answers.look
 
     def close(self) -> None:
-        """Ends what works in the background."""
+        """Ends the background threads."""
         self._answers.close()
         self.worker.close()
 
     def ask(self) -> None:
-        """Has the page show what it is set to, unless it does or is about to."""
+        """Updates the page to its settings, unless it shows them already or is about to."""
         if not self.story.rows:
             return
         with self._lock:
@@ -250,17 +252,17 @@ class App:
         step = num_views - 1 if self.controls.is_following else self.controls.settings.step
         self.controls.set_step(step, num_views)
         with self._lock:
-            self._asked = None  # the same question has another answer now
+            self._asked = None  # the same query now has another result
         self.ask()
 
     def _ask_again(self) -> None:
-        """Repeats the question as more is known; what is shown stays right."""
+        """Repeats the query on the larger map; what is shown stays valid."""
         with self._lock:
             self._asked = Query(self.controls.settings, self.canvas.pose)
             self.worker.ask(self._asked)
 
     def _mark_stale(self, question: Query, *, camera: bool, view: bool, scene: bool) -> None:
-        """Marks each part of the page as belonging to another question."""
+        """Marks each part of the page as belonging to another query."""
         step, layer = question.settings.step, question.settings.layer
         if camera:
             self.controls.mark_camera_stale()

@@ -1,12 +1,11 @@
-"""The voxels of a map as few enough blocks to be drawn, and how well they would render.
+"""Merges the voxels of a map into blocks for drawing, and colors them by renderability.
 
-A map of a house has a million voxels; a browser wants a tenth of that. Voxels are merged by
-twos along each axis, again and again, until few enough are left: surfaces stay closed, whatever the
-budget, and only get coarser.
+A map of a house has a million voxels; a browser can draw a tenth of that. Voxels are merged in
+pairs along each axis, repeatedly, until few enough are left: surfaces stay closed and only become
+coarser.
 
-R belongs to a voxel and a camera together. To color a map, R and its terms are averaged over
-positions that see the voxel: some that are spread over known free space, or the one where a camera
-is held.
+R depends on a voxel and a camera. To color a map, R and its terms are averaged over positions that
+see the voxel: either positions spread over known free space, or that of the dragged camera.
 
 Shape symbols: N rows of the map; m occupied ones; n blocks; P positions.
 """
@@ -40,7 +39,8 @@ from r3jax.scoring.terms import score_voxels
 from r3jax.visibility.views import panorama_view
 
 NUM_PROBES = 24
-"""Positions that a map's colors are averaged over: a large house has every room in view."""
+"""Number of positions over which a map's colors are averaged: enough to see every room of a large
+house."""
 
 
 class SurfaceTerms(eqx.Module):
@@ -56,10 +56,10 @@ class SurfaceTerms(eqx.Module):
     """eps, the term of the color's consistency; 0 where no position sees the voxel."""
 
     resolution: Float[Array, " N"]
-    """gamma, the term of the sharpness; 0 where no position sees the voxel."""
+    """gamma, the term of the resolution; 0 where no position sees the voxel."""
 
     sightings: Float[Array, " N"]
-    """How many positions see the voxel."""
+    """Number of positions that see the voxel."""
 
 
 def probe_positions(grid: OccupancyGrid, num: int = NUM_PROBES) -> np.ndarray:
@@ -138,14 +138,14 @@ def _add_sightings(
 
 
 BUDGET = 300_000
-"""Blocks that a browser gets at most."""
+"""Maximum number of blocks for a browser."""
 
 QUANTITIES = (*TERMS, "color")
-"""What blocks can be colored by: R, its terms, and the mean color that was seen."""
+"""Quantities to color blocks by: R, its terms, and the mean observed color."""
 
 
 CAUSE = "cause"
-"""Colors blocks by why a view was taken; beside `QUANTITIES`, for that depends on the view."""
+"""Colors blocks by the cause of a view; not one of `QUANTITIES`, as it depends on the view."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ class Blocks:
 
     @property
     def num_voxels(self) -> int:
-        """Voxels that the blocks stand for."""
+        """Number of voxels in the blocks."""
         return len(self.rows)
 
     def mean(self, values: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:

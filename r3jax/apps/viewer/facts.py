@@ -1,7 +1,7 @@
-"""What the page says of a view, of the dragged camera and of what is drawn, as HTML.
+"""The page's text about a view, the dragged camera and the drawing, as HTML.
 
-The parts are macros of `facts.html`, which escapes what comes from files. Every quantity has a
-tooltip: a name that `HINTS` does not know is an error.
+The parts are macros of `facts.html`, which escapes content of files. Every quantity has a tooltip:
+a name that is not in `HINTS` is an error.
 """
 
 import io
@@ -34,13 +34,13 @@ HINTS = {
     "Nothing ever shows the insides of walls and furniture, so it stays below 100 %.",
     "mean renderability": "Renderability, averaged over fixed test views in the free space that is "
     "known. 1 is perfect.",
-    "R before this view": "Renderability of this very view just before it joined the map. A low "
-    "value means that the view was worth taking, a high one that it repeated what was known.",
+    "R before this view": "Renderability of this view just before it joined the map. A low value "
+    "means that the view showed something new, a high one that it repeated known surfaces.",
     # The camera that is dragged.
     "renderability R": "How well an image from this camera could be rendered from the views so "
     "far: 0 is not at all, 1 is perfect. R = bias x noise x resolution, averaged over the pixels.",
-    "bias": "Viewing angle: 1 where a surface was seen from this very direction, falling to 0 as "
-    "the nearest direction from which it was seen turns away.",
+    "bias": "Viewing angle: 1 where a surface was seen from exactly this direction, falling to 0 "
+    "with the angle to the nearest direction from which it was seen.",
     "noise": "Color agreement: 1 where the views agree on a surface's color, less on shiny or "
     "transparent surfaces.",
     "resolution": "Closeness: 1 where some view was at least as close to the surface as this "
@@ -48,8 +48,8 @@ HINTS = {
     "known surface": "Share of the pixels that show a surface in the map. All other pixels count "
     "as R = 0.",
     "unexplored cells": "U_G: cells of the coarse grid in view that no view has shown yet.",
-    "missing quality": "U_R: the sum of 1 - R over the voxels in view. High means that a view "
-    "from here would improve much.",
+    "missing quality": "U_R: the sum of 1 - R over the voxels in view. A view from here "
+    "would improve much if it is high.",
     "utility this way": "Utility of looking straight ahead from here: unexplored cells (weighted "
     "by lambda1) plus missing quality.",
     "utility the best way": "The same for the best direction from this position: the ring in the "
@@ -57,14 +57,14 @@ HINTS = {
     # Candidates and causes.
     "candidates": "Poses that the planner could choose from, best score first. Score = share of "
     "the utility minus lambda2 times share of the path.",
-    "promise": "Utility of the chosen view, worked out pixel by pixel and divided among four "
+    "promise": "Utility of the chosen view, recomputed pixel by pixel and divided among four "
     "causes: unexplored cells (weighted by lambda1) plus the sum of 1 - R over the voxels in view. "
-    "The planner's own number in the list above may differ, for planners estimate it faster.",
+    "The planner's own number in the list above may differ: planners use a faster estimate.",
     **dict(
         zip(
             CAUSES,
             (
-                "Unexplored space that the view was to show.",
+                "Unexplored space in view.",
                 "Surfaces seen only from directions far from this view's.",
                 "Surfaces whose color differed from view to view.",
                 "Surfaces seen only from farther away.",
@@ -73,7 +73,6 @@ HINTS = {
         )
     ),
 }
-"""Tooltips by the name of the quantity on the page."""
 """Tooltips by the name of the quantity on the page."""
 
 PLACES = ("places in free space", "the dragged camera")

@@ -50,7 +50,7 @@ def legend_of(viewer) -> str:
 
 
 def test_the_panel_tells_the_shares_once_they_are_known(viewer, reason):
-    facts = lambda: viewer.app.controls._facts.content.partition("what it promised")[2]
+    facts = lambda: viewer.app.controls._facts.content.partition("predicted utility")[2]
     wait_until(lambda: " %<" in facts())  # the page asks again by itself
     shown = [float(share) for share in re.findall(r">([\d.]+) %<", facts())]
     np.testing.assert_allclose(shown, 100.0 * reason.totals / reason.utility, atol=0.0501)
