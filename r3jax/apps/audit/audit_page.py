@@ -106,10 +106,10 @@ def _cards(audit: Audit) -> dict[str, str]:
     if audit.source.is_complete:
         bad = (1.0 - found.fine_share) * found.is_seen.sum() * audit.survey.voxel_size**2
         cards["of the surface is seen well enough"] = fine
-        cards["of surface to mend, all sides counted"] = sentences.area(audit, float(bad))
+        cards["of surface that needs more views"] = sentences.area(audit, float(bad))
     else:
-        cards["of what they show is seen well enough"] = fine
-        cards["of it is not known"] = f"{100 * audit.shares[audit.unknown]:.0f} %"
+        cards["of their pixels is seen well enough"] = fine
+        cards["of their pixels is not known"] = f"{100 * audit.shares[audit.unknown]:.0f} %"
     where = "" if audit.source.is_complete else ", where it is known"
     cards[f"mean R of the frames{where}"] = f"{audit.mean_renderability:.2f}"
     if plan.views:

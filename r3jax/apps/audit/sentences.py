@@ -10,26 +10,26 @@ from r3jax.apps.audit.suggest import DIRECTIONS, OVERLAP, Suggestion
 from r3jax.captures.alignment import AXES
 
 MEANING = {
-    "fine": f"seen well enough: R of at least {FINE:g} from where people stand",
-    "angle": "seen, but only from directions far from those in which one would look at it",
-    "rare": f"only {FEW - 1} pictures or fewer show it, none of them from where one would look",
-    "distance": "only seen from farther away than one would look at it",
-    "noise": "its color differs from picture to picture: reflections, exposure, poses that are off",
-    "unseen": "free space ends there in something that no picture shows",
-    NOT_KNOWN: "no points here: plain, dark, glossy, or never seen from two sides",
+    "fine": f"seen well enough: R ≥ {FINE:g} from where a person would stand",
+    "angle": "seen, but only from other directions than those from which people would look at it",
+    "rare": f"at most {FEW - 1} pictures show it, none of them from where people would look at it",
+    "distance": "only seen from farther away than people would look at it",
+    "noise": "its color differs between pictures: reflections, exposure or inaccurate poses",
+    "unseen": "borders on free space, but no picture shows it",
+    NOT_KNOWN: "no depth here: plain, dark or glossy surfaces, or seen from one side only",
 }
-"""Remedy of every cause, for the table."""
+"""What each cause means, for the table."""
 
 REMEDY = {
     "fine": "",
-    "angle": "go round it: pictures from the missing sides",
-    "rare": "take a picture of it from where people would look at it",
+    "angle": "take pictures from the missing sides",
+    "rare": "take pictures from where people would look at it",
     "distance": "go nearer",
-    "noise": "lock exposure and white balance; avoid reflections; check the poses",
-    "unseen": "look into it, if it belongs to the place",
-    NOT_KNOWN: "let pictures overlap more, from more sides; plain walls need depth images",
+    "noise": "lock exposure and white balance, avoid reflections, check the poses",
+    "unseen": "take a picture of it if it belongs to the scene",
+    NOT_KNOWN: "take more overlapping pictures from more sides; plain walls need depth images",
 }
-"""What one can do."""
+"""Remedy of each cause, for the table."""
 
 SHORT = {
     "angle": "only from other angles",
@@ -37,7 +37,7 @@ SHORT = {
     "distance": "only from too far away",
     "noise": "in contradictory colors",
 }
-"""How a surface was seen that suffers from a cause."""
+"""How a surface with each cause was seen."""
 
 _DO = {
     "angle": "Go round",
@@ -45,45 +45,45 @@ _DO = {
     "distance": "Go nearer",
     "noise": "Keep the light even",
 }
-"""What to do against a cause, in a word or two."""
+"""Remedy of each cause in a word or two."""
 
 GOOD, _AGAIN = 0.85, 0.3
-"""Shares seen well enough: from the first on a capture is good for splats; below the second hardly
-anything can be kept."""
+"""Shares seen well enough: above the first a capture is good for splats, below the second it should
+be taken again."""
 
 _MOST = 0.5
-"""Share of the pictures that must have a pose."""
+"""Minimum share of pictures with a pose."""
 
 _SEVERE = ("pose", "scale", "ray", "camera", "stray")
-"""Faults that spoil a model, however much is seen."""
+"""Faults that spoil a model even if everything is seen."""
 
 _LEAST_TOLD, _THINGS = 0.03, 3
-"""Share from which on a cause is among the things to do; and how many of these there are."""
+"""Minimum share of a cause among the things to do, and the maximum number of these."""
 
 _DEPTH_FROM = {
     "depth": "depth images",
     "stereo": "COLMAP's stereo, computed from the photos",
-    "sweep": "a comparison of the photos with each other (plane sweep)",
+    "sweep": "multi-view stereo of the photos (plane sweep)",
     "model": "the trained splat",
-    "tracks": "the points whose tracks name the picture",
-    "cloud": "the cloud's points that no nearer one hides",
+    "tracks": "the sparse points matched in each picture",
+    "cloud": "the visible points of the cloud",
 }
 """Source of the surfaces."""
 
 _MOST_SAID = 4
-"""Findings on single pictures that the summary repeats."""
+"""Maximum number of findings on single pictures in the summary."""
 
 _DOUBTFUL = 5.0
-"""A guess of the vertical that may be off by more is told first [deg]."""
+"""An estimated vertical with a larger uncertainty is mentioned first [deg]."""
 
 _MOST_NAMED = 6
-"""Pictures that cannot be read which a sentence names."""
+"""Maximum number of unreadable pictures named in a sentence."""
 
 CONTRADICTED = (
     "Blur, exposure, white balance and single poses are not known: depth and cameras contradict "
     "each other, so pictures cannot be compared."
 )
-"""What is said of the pictures where nothing fits."""
+"""Remark on the pictures if depth and poses contradict each other."""
 
 _ORDINARY = ("angle", "rare", "distance", "noise")
 
@@ -116,14 +116,14 @@ def origin(audit: Audit) -> str | None:
         return None
     return (
         f"The capture is far from its origin: ({point(subtracted)}) was subtracted from all "
-        "coordinates before they were computed with, and added to all that are written."
+        "coordinates for the computation, and added back in all output files."
     )
 
 
 def verdict(audit: Audit) -> list[str]:
     """Summarizes the audit, one sentence each."""
     sentences = [_surfaces(audit)]
-    first = int(audit.survey.is_one_place)  # nothing goes before that
+    first = int(audit.survey.is_one_place)  # this one stays first
     if (audit.survey.up.within or 0.0) > _DOUBTFUL:
         sentences.insert(first, vertical(audit))
     sentences[first:first] = [*unread(audit), *without_depth(audit)]
@@ -133,13 +133,13 @@ def verdict(audit: Audit) -> list[str]:
         sentences.insert(0, f"Warning: these results are unreliable: {audit.survey.doubt}")
     if audit.faults.findings:
         said = " ".join(finding.what for finding in audit.faults.findings[:_MOST_SAID])
-        sentences.append(f"The pictures themselves: {said}")
+        sentences.append(f"Problems of single pictures: {said}")
     if not audit.faults.fits:
         sentences.append(CONTRADICTED)
     if audit.is_object:
         sentences.append(
-            "The cameras look inward at an object: it is judged from the dome of the cameras round "
-            "it, not from where people could stand."
+            "The cameras look inward at an object, so it is evaluated from the dome of cameras "
+            "around it, not from where people could stand."
         )
     if audit.unseen:
         sentences.append(
@@ -149,35 +149,35 @@ def verdict(audit: Audit) -> list[str]:
 
 
 def first_things(audit: Audit) -> list[str]:
-    """Lists what a reader must know before the verdict: pictures that are not in it."""
+    """Lists remarks that come before the verdict: pictures that are not part of it."""
     remark = audit.source.remark
     return [*([] if remark is None else [remark]), *unread(audit), *without_depth(audit)]
 
 
 def _surfaces(audit: Audit) -> str:
-    """Says how much of the seen surface renders well.
+    """Describes how much of the surface was seen well enough.
 
     For pictures from one place, that is not known.
     """
     survey = audit.survey
     if survey.is_one_place:
         return (
-            f"All pictures were taken from one place (within {survey.span:.2g} {survey.unit}; half "
-            f"of what they show is {survey.median_depth:.2g} {survey.unit} away or more): every "
-            "surface was seen from one direction only, and how it would render from elsewhere is "
-            "not known. Take pictures from other places, a step apart."
+            f"All pictures were taken from one place (within {survey.span:.2g} {survey.unit}, at a "
+            f"median depth of {survey.median_depth:.2g} {survey.unit}): every surface was seen "
+            "from one direction only, so how it would render from other places is not known. Take "
+            "pictures from other places, a step apart."
         )
     shares = {cause: cause_share(audit, cause) for cause in _ORDINARY}
     ordered = sorted(shares, key=lambda cause: -shares[cause])
     parts = [f"{100 * shares[c]:.0f} % is seen {SHORT[c]}" for c in ordered if shares[c] >= 0.005]
     fine = f"{100 * cause_share(audit, 'fine'):.0f} %"
     if audit.source.is_complete:
-        start = f"{fine} of the surface that a person sees from where one can stand"
+        start = f"{fine} of the surface visible from where a person could stand"
     else:
         what = "pictures" if audit.is_own_path else "frames"
         start = (
-            f"Without a depth camera, surfaces are known from {_DEPTH_FROM[audit.source.kind]}. "
-            f"{fine} of what the {what} show"
+            f"There is no depth camera: depth comes from {_DEPTH_FROM[audit.source.kind]}. "
+            f"{fine} of the pixels of the {what}"
         )
         parts.append(f"{_unknown(audit)} is not known ({MEANING[NOT_KNOWN]})")
     well = f"R ≥ {FINE:g}" + ("" if audit.source.has_images else ", if colors agree")
@@ -185,54 +185,53 @@ def _surfaces(audit: Audit) -> str:
 
 
 def _promises(audit: Audit) -> list[str]:
-    """Says how the frames would render, and what further views would add."""
+    """Describes how the frames would render, and the expected gain of further views."""
     found, plan = audit.diagnosis, audit.plan
     sentences: list[str] = []
     mean = audit.mean_renderability
     worst = audit.frames[int(np.nanargmin(np.r_[audit.renderability, np.inf])) % len(audit.frames)]
     what = (
-        "From the other pictures alone, a picture" if audit.is_own_path else "A frame of the path"
+        "A picture, rendered from the other ones," if audit.is_own_path else "A frame of the path"
     )
     beside = "" if audit.source.is_complete else ", where it is known"
     if audit.is_saturated:
-        sentences.append(f"{what} renders with R {mean:.2f} on average. {saturation()}")
+        sentences.append(f"{what} has R {mean:.2f} on average. {saturation()}")
     else:
         sentences.append(
-            f"{what} renders with R {mean:.2f} on average{beside}; the worst "
-            f"({worst.label}) {worst.score.renderability:.2f}."
+            f"{what} has R {mean:.2f} on average{beside}; the worst ({worst.label}) has "
+            f"{worst.score.renderability:.2f}."
         )
     if plan.views:
         count = len(plan.views)
         views, drawn = (
-            ("One further view", "one at a random place")
+            ("One further view", "a random view")
             if count == 1
-            else (f"{count} further views", "as many at random places")
+            else (f"{count} further views", f"{count} random views")
         )
         sentences.append(
-            f"{views} would raise the mean over all surfaces"
-            f"{'' if audit.source.is_complete else ' that are known'} from {found.mean:.2f} to "
-            f"{plan.after.mean:.2f}, as far as it can be predicted; {drawn} "
-            f"{plan.random_mean[-1]:.2f}."
+            f"{views} would raise the mean over all{'' if audit.source.is_complete else ' known'} "
+            f"surfaces from {found.mean:.2f} to {plan.after.mean:.2f} (a prediction); {drawn} "
+            f"would raise it to {plan.random_mean[-1]:.2f}."
         )
     return sentences
 
 
 def vertical(audit: Audit) -> str:
-    """Says which direction is up, and how certain that is."""
+    """Describes which direction is up, and its uncertainty."""
     up = audit.survey.up
     if up.within is None:
         return f"Up is {_up_name(up.direction)} of the capture."
     from_what = "floors, walls and " if audit.source.is_dense else ""
     numbers = ",".join(f"{value:.2f}" for value in up.direction)
     return (
-        f"Up is a guess, within {up.within:.0f} degrees: {_up_name(up.direction)} of the capture, "
-        f"from {from_what}how the cameras were held. Where another direction is up, give it "
+        f"Up was estimated to within {up.within:.0f} degrees: {_up_name(up.direction)} of the "
+        f"capture, from {from_what}the cameras' orientation. If that is wrong, give the direction "
         f"(--up=z, or three numbers such as --up={numbers})."
     )
 
 
 def unread(audit: Audit) -> list[str]:
-    """Says which pictures could not be read, and why: one sentence, or none."""
+    """Describes which pictures could not be read, and why: one sentence, or none."""
     left_out = audit.faults.left_out
     if not left_out:
         return []
@@ -240,19 +239,21 @@ def unread(audit: Audit) -> list[str]:
     named = "; ".join(list(left_out.values())[:_MOST_NAMED])
     more = len(left_out) - _MOST_NAMED
     rest = f"; and {more} more, named in audit.json" if more > 0 else ""
-    verb = "is left out: it" if len(left_out) == 1 else "are left out: they"
-    return [f"{len(left_out)} of the {total} pictures {verb} cannot be read ({named}{rest})."]
+    verb = "was" if len(left_out) == 1 else "were"
+    return [
+        f"{len(left_out)} of the {total} pictures {verb} left out as unreadable ({named}{rest})."
+    ]
 
 
 def without_depth(audit: Audit) -> list[str]:
-    """Says how many pictures have no depth: one sentence, or none."""
+    """Describes how many pictures have no depth: one sentence, or none."""
     count = len(audit.faults.without_depth)
     if not count:
         return []
     what = "have no depth" if audit.source.is_complete else "show no point"
     return [
-        f"{count} of the {audit.faults.looked_at} pictures {what}: they are left out, and what "
-        "they show is not known."
+        f"{count} of the {audit.faults.looked_at} pictures {what}: they are left out, and their "
+        "surfaces are not known."
     ]
 
 
@@ -268,10 +269,10 @@ def cause_share(audit: Audit, cause: str) -> float:
 def saturation() -> str:
     """Explains what R cannot measure in a capture that is covered well."""
     return (
-        f"With a mean of {SATURATED:g} or more, R says that these pictures show what others show "
-        "well enough, and not which of them renders better: of a kitchen of 250 pictures with a "
-        "mean of 0.96, each held out once, R and PSNR had a rank correlation of -0.00. So these "
-        "pictures are not ranked; what is left to gain among them lies in the pictures themselves."
+        f"With a mean of {SATURATED:g} or more, the pictures are covered well by each other, and R "
+        "does not tell which of them renders better: for 250 pictures of a kitchen with a mean of "
+        "0.96, each held out once, the rank correlation of R and PSNR was 0.00. So these pictures "
+        "are not ranked; only better pictures, not more of them, would improve the result."
     )
 
 
@@ -286,7 +287,7 @@ def reason(audit: Audit, view: Suggestion, letters: Iterable[str]) -> str:
     parts: list[str] = []
     total = sum(view.causes.values())
     if view.num_mended:
-        parts.append(f"about {area(audit, view.num_mended * face)} is then seen well enough")
+        parts.append(f"about {area(audit, view.num_mended * face)} would then be seen well enough")
     if total:
         named = sorted(view.causes, key=lambda cause: -view.causes[cause])
         shares = [
@@ -294,16 +295,14 @@ def reason(audit: Audit, view: Suggestion, letters: Iterable[str]) -> str:
             for c in named
             if view.causes[c] >= 0.005 * total
         ]
-        parts.append(
-            f"of {area(audit, total * face)} in sight that is not yet: {', '.join(shares)}"
-        )
+        parts.append(f"it shows {area(audit, total * face)} that is not yet: {', '.join(shares)}")
     if len(view.cells):
         cells = area(audit, len(view.cells) * audit.survey.cell_size**2)
-        parts.append(f"looks into about {cells} of what no picture shows")
+        parts.append(f"it shows about {cells} that no picture shows")
     names = list(letters)
     if names:
         parts.append(f"regions {', '.join(names)}" if len(names) > 1 else f"region {names[0]}")
-    return "; ".join(parts) or "adds a direction to what it shows"
+    return "; ".join(parts) or "it adds a direction to the surfaces in view"
 
 
 def method(audit: Audit) -> list[str]:
@@ -316,77 +315,74 @@ def method(audit: Audit) -> list[str]:
         f"Voxels of {length(audit, survey.voxel_size)}, cells of free space of "
         f"{length(audit, survey.cell_size)}, visible up to {length(audit, 5.0)}; the depths have "
         f"the median {survey.median_depth:.3g} {survey.unit} and the 95th percentile "
-        f"{survey.far_depth:.3g} {survey.unit}, and the sizes follow from them where they are not "
-        "given.",
+        f"{survey.far_depth:.3g} {survey.unit}. Sizes that are not given are derived from them.",
         vertical(audit),
-        "Renderability R (arXiv 2601.07484) of a surface for a place to look from is bias × noise "
-        "× resolution: the angle to the nearest direction it was seen from, the consistency of "
-        "its color, and the best distance it was seen from.",
-        f"Surfaces: every voxel is scored from those of {len(audit.standpoints)} "
-        "standpoints that see it, with the camera of most pictures; its numbers are the means. "
-        "Areas count one face of each voxel: floor, walls, ceiling and all sides of the furniture, "
-        "so several times the floor; where depth is noisy, walls are several voxels thick, and "
-        "areas too large by that.",
+        "Renderability R (arXiv 2601.07484) of a surface from a position is bias × noise × "
+        "resolution: the angle to the nearest direction from which it was seen, the consistency "
+        "of its color, and the smallest distance from which it was seen.",
+        f"Surfaces: every voxel is scored from those of {len(audit.standpoints)} standpoints that "
+        "see it, with the camera of most pictures; its score is the mean. Areas count one face of each "
+        "voxel on the floor, walls, ceiling and all sides of furniture, so they are several times "
+        "the floor area. With noisy depth walls are several voxels thick, and areas too large.",
         _standing(audit),
     ]
     pixels = (
-        "; one that shows no voxel counts 0"
+        "; pixels without a voxel count as 0"
         if source.is_complete
-        else " that show a known surface: a voxel that two pictures or more have measured"
+        else " with a known surface (a voxel measured by at least two pictures)"
     )
     if audit.is_own_path:
         count = len(audit.seen.folds)
         sentences.append(
-            f"Frames: the capture's own, each scored by a map without every {_ordinal(count)} "
-            "picture, itself among them: what a model trained without these would have to invent. "
-            f"R of a frame is the mean over its pixels{pixels}."
+            f"Frames: the capture's own, each scored on a map without it and every "
+            f"{_ordinal(count)} picture, like a model trained without these. R of a frame is the mean over its "
+            f"pixels{pixels}."
         )
     else:
         sentences.append(
-            "Frames: the path's, scored by the map of all pictures. R of a frame is the mean over "
-            f"its pixels{pixels}."
+            "Frames: those of the path, scored on the map of all pictures. R of a frame is the "
+            f"mean over its pixels{pixels}."
         )
     where = (
-        f"in space known to be free, {length(audit, 0.3)} from everything else, connected to where "
-        "the camera was and at its heights"
+        f"in free space, {length(audit, 0.3)} from everything else, connected to the camera's "
+        "positions and at its heights"
         if source.is_dense
-        else f"within the hull of the camera's positions and {length(audit, 0.3)} round it, "
+        else f"up to {length(audit, 0.3)} outside the hull of the camera's positions, "
         f"{length(audit, 0.3)} from every voxel, where a camera was or a ray to a point passed"
     )
     if audit.is_object:
         where = (
-            "on the dome of the cameras round the object that they look at, not below the lowest "
-            f"of them and {length(audit, 0.3)} from every voxel"
+            "on the dome of cameras around the object, not below the lowest of them and "
+            f"{length(audit, 0.3)} from every voxel"
         )
     sentences.append(
-        f"Views: of {len(audit.places.eyes)} places {where}, {DIRECTIONS} directions each, those "
-        f"of which {100 * OVERLAP:.0f} % or more show what is known (or a picture could not be "
-        "registered); "
-        "of all these the one that raises the renderability of all surfaces most is imagined as "
-        "taken before the next one is chosen. Surfaces that were never seen, and "
-        "colors, cannot be predicted."
+        f"Views: candidates are {len(audit.places.eyes)} positions {where}, with {DIRECTIONS} "
+        f"directions each; at least {100 * OVERLAP:.0f} % of a view must show known surfaces, so "
+        "that the picture can be registered. The candidate that raises the mean renderability of "
+        "all surfaces most is simulated before the next one is chosen. Colors, and surfaces that "
+        "were never seen, cannot be predicted."
     )
     if (moved := origin(audit)) is not None:
         sentences.append(moved)
     if not source.is_metric:
         sentences.append("The scale of this capture is unknown; lengths are in its own units (u).")
     if not source.has_images:
-        sentences.append("The images are missing: nothing can be said about noise.")
+        sentences.append("The images are missing, so noise is not known.")
     return sentences
 
 
 def _standing(audit: Audit) -> str:
-    """Says whether a person can stand where the audit looks from."""
+    """Describes whether a person can stand at the standpoints."""
     if not audit.places.is_checked:
         return (
-            "Whether a person could stand at these places is not known: the floor below the "
+            "It is not known whether a person could stand at these positions: the floor below the "
             "cameras was not seen, or no one walked there."
         )
     over = len(audit.places.eyes) - audit.places.num_standing
     return (
-        "A person can stand at these places: between the shin and the head nothing is in the way, "
-        f"as far as depth shows. At {over} more places a camera can be held with an arm; views are "
-        "looked for there, too."
+        "A person can stand at these positions: depth shows nothing in the way between shin and "
+        f"head. {over} more positions, where a camera can be held with an arm, are searched for "
+        "views, too."
     )
 
 
@@ -403,7 +399,7 @@ def state(audit: Audit) -> str:
 
 
 def _posed_share(audit: Audit) -> float:
-    """Returns the share of the pictures that a structure from motion found a pose for."""
+    """Returns the share of pictures for which structure from motion found a pose."""
     model = audit.source.reconstruction
     return 1.0 if model is None else model.posed / max(model.pictures, 1)
 
@@ -420,12 +416,10 @@ def headline(audit: Audit) -> str:
         return f"{words}: only {model.posed} of {model.pictures} pictures have a pose."
     fine = f"{100 * cause_share(audit, 'fine'):.0f} %"
     if audit.source.is_complete:
-        return (
-            f"{words}: {fine} of what a person sees from where one can stand is seen well enough."
-        )
+        return f"{words}: {fine} of the visible surface is seen well enough."
     return (
-        f"{words}: {fine} of what the pictures show is seen well enough; of {_unknown(audit)} "
-        "nothing is known."
+        f"{words}: {fine} of the pictures' pixels is seen well enough, {_unknown(audit)} is not "
+        "known."
     )
 
 
@@ -440,7 +434,9 @@ def advice(audit: Audit, titles: dict[str, str]) -> list[tuple[str, str]]:
     if survey.doubt is not None or not faults.fits:
         return [("Check the depth and the poses", survey.doubt or CONTRADICTED)]
     if survey.is_one_place:
-        return [("Take pictures from other places", "A step apart, round all that matters.")]
+        return [
+            ("Take pictures from other places", "A step apart, around everything that matters.")
+        ]
     looked = max(1, faults.looked_at)
     found = [
         (1.0 if f.kind in _SEVERE else len(f.frames) / looked, titles[f.kind], f.todo)
@@ -448,13 +444,13 @@ def advice(audit: Audit, titles: dict[str, str]) -> list[tuple[str, str]]:
     ]
     found += _about_surfaces(audit)
     if not audit.source.is_complete and audit.shares[NOT_KNOWN] >= _LEAST_TOLD:
-        unknown = f"Of {_unknown(audit)} nothing is known: {MEANING[NOT_KNOWN]}."
+        unknown = f"{_unknown(audit)} is not known: {MEANING[NOT_KNOWN]}."
         found.append((audit.shares[NOT_KNOWN], "Let pictures overlap more", unknown))
     if audit.unseen:
         whole = float(audit.diagnosis.is_seen.sum()) * survey.voxel_size**2
-        dark = f"About {area(audit, audit.unseen_area)} that no picture shows (dotted on the plan)."
+        dark = f"No picture shows about {area(audit, audit.unseen_area)} (dotted on the plan)."
         share = audit.unseen_area / max(audit.unseen_area + whole, 1e-9)
-        found.append((share, "Look into what is dark", dark))
+        found.append((share, "Photograph the unseen places", dark))
     found.sort(key=lambda item: -item[0])
     return [(what, text) for _, what, text in found[:_THINGS]]
 
@@ -469,9 +465,9 @@ def _about_surfaces(audit: Audit) -> list[tuple[float, str, str]]:
     count = len(audit.plan.views)
     seen = [f"{100 * missing[cause]:.0f} % {SHORT[cause]}" for cause in told]
     rest = (
-        f"What was seen {listed(seen)} is in sight there."
+        f"They show surfaces seen {listed(seen)}."
         if seen
-        else "They look at what was seen least well; little is missing of what is known."
+        else "They show the surfaces seen least well; few of the known ones need more views."
     )
     return [
         (1.0, "Take the picture below" if count == 1 else f"Take the {count} pictures below", rest)

@@ -146,9 +146,7 @@ def _reasons(run: Run, outlook: Outlook, on_progress: Progress) -> Figure | str:
 
     The forecast uses the same maps.
     """
-    on_progress(
-        "looking back at the views", len(run.rows) - 1
-    )  # no view was chosen after the last one
+    on_progress("explaining the views", len(run.rows) - 1)  # no view was chosen after the last one
     states = outlook.watch(_counted(states_of(run), on_progress))
     try:
         return reasons_figure(utility_by_cause(run, states))

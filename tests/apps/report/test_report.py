@@ -58,7 +58,7 @@ def reported(tmp_path_factory):
             stages[-1][2] += steps
 
     page = write_report(run, result.state.map_state, result.state.grid, on_progress)
-    assert stages == [["looking back at the views", 3, 3], ["drawing the report", 7, 7]]
+    assert stages == [["explaining the views", 3, 3], ["drawing the report", 7, 7]]
     return run, result, page
 
 

@@ -56,16 +56,16 @@ _CAPACITY = 1 << 17
 
 _WARNINGS: dict[Kind, str] = {
     "blur": "Blurred: move more slowly, or turn on the light.",
-    "focus": "Out of focus: stay farther away, and wait until it has settled.",
+    "focus": "Out of focus: keep a larger distance, and wait for the autofocus.",
     "brightness": "Brightness has changed: lock the exposure.",
     "tint": "White balance has changed: lock it.",
-    "pose": "The pose contradicts the depth: go back to what was seen before, slowly.",
+    "pose": "The pose contradicts the depth: go back slowly to surfaces seen before.",
     "scale": "The scale of the depth is wrong.",
     "ray": "Depth is measured along the ray, and not along the axis.",
     "camera": "The intrinsics of the camera are wrong.",
     "repeat": "Nothing new: move on.",
 }
-"""What to say of the latest frame at once."""
+"""Immediate advice on the latest frame."""
 
 
 class Guide:

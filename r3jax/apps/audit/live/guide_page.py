@@ -249,7 +249,7 @@ class ScanProgress:
     """What is done."""
 
     fine_share: float
-    """Share of what a person sees from where one can stand that is seen well enough."""
+    """Share of the surface visible from where a person could stand that is seen well enough."""
 
     causes: dict[str, float]
     """Share of the same of each other cause."""
@@ -264,15 +264,15 @@ class ScanProgress:
     """Left, right, bottom and top of the plan [m]."""
 
     def words(self, pictures: int) -> str:
-        """Says how much is done, what is missing, and whether that is enough."""
+        """Describes the progress, what is missing, and whether that is enough."""
         parts = [
             f"{100 * share:.0f} % {SHORT[cause]}"
             for cause, share in sorted(self.causes.items(), key=lambda item: -item[1])
             if share >= 0.01
         ]
         text = (
-            f"{100 * self.fine_share:.0f} % of what a person sees from where one can stand is seen "
-            f"well enough ({self.area:.0f} m² of surfaces, {pictures} pictures)"
+            f"{100 * self.fine_share:.0f} % of the visible surface is seen well enough "
+            f"({self.area:.0f} m² in {pictures} pictures)"
         )
         rest = f"; seen {listed(parts)}." if parts else "."
         end = " That is good for splats: you can stop here." if self.fine_share >= GOOD else ""
