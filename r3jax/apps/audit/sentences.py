@@ -321,9 +321,10 @@ def method(audit: Audit) -> list[str]:
         "resolution: the angle to the nearest direction from which it was seen, the consistency "
         "of its color, and the smallest distance from which it was seen.",
         f"Surfaces: every voxel is scored from those of {len(audit.standpoints)} standpoints that "
-        "see it, with the camera of most pictures; its score is the mean. Areas count one face of each "
-        "voxel on the floor, walls, ceiling and all sides of furniture, so they are several times "
-        "the floor area. With noisy depth walls are several voxels thick, and areas too large.",
+        "see it, with the camera of most pictures; its score is the mean. Areas count one face of "
+        "each voxel on the floor, walls, ceiling and all sides of furniture, so they are several "
+        "times the floor area. With noisy depth walls are several voxels thick, and areas too "
+        "large.",
         _standing(audit),
     ]
     pixels = (
@@ -334,9 +335,9 @@ def method(audit: Audit) -> list[str]:
     if audit.is_own_path:
         count = len(audit.seen.folds)
         sentences.append(
-            f"Frames: the capture's own, each scored on a map without it and every "
-            f"{_ordinal(count)} picture, like a model trained without these. R of a frame is the mean over its "
-            f"pixels{pixels}."
+            "Frames: the capture's own, each scored on a map without it and every "
+            f"{_ordinal(count)} picture, like a model trained without these. R of a frame is the "
+            f"mean over its pixels{pixels}."
         )
     else:
         sentences.append(
