@@ -20,7 +20,7 @@ import tyro
 from experiments.pages.artifacts import joint_origin, markdown_table, write_markdown
 from r3jax.apps.benchmark.photos.pool import open_pool
 from r3jax.apps.benchmark.photos.protocol import PhotoTerms
-from r3jax.apps.benchmark.photos.records import kept_or_made, table_rows
+from r3jax.apps.benchmark.photos.records import load_or_compute, table_rows
 from r3jax.files import write_atomic
 
 NAME = "photo_pools"
@@ -88,7 +88,7 @@ def main(options: Options) -> Path:
     for seed in seeds:
         for pool in pools:
             for chooser in options.choosers:
-                record = kept_or_made(options.work, pool, chooser, size.terms, seed)
+                record = load_or_compute(options.work, pool, chooser, size.terms, seed)
                 records.append(record)
                 psnr = record["metrics"]["psnr"]["mean"]
                 print(f"{pool.name} {chooser} seed {seed}: {psnr:.2f} dB", flush=True)

@@ -271,10 +271,10 @@ def nan_unless_valid(
         lengths: of maps and grids, which must be positive and finite.
     """
     positive = jnp.stack([camera.fx, camera.fy, *lengths])
-    is_sound = jnp.all((positive > 0.0) & jnp.isfinite(positive))
-    is_sound &= jnp.isfinite(camera.cx) & jnp.isfinite(camera.cy) & is_rigid(T_world_camera)
+    is_valid = jnp.all((positive > 0.0) & jnp.isfinite(positive))
+    is_valid &= jnp.isfinite(camera.cx) & jnp.isfinite(camera.cy) & is_rigid(T_world_camera)
     # A factor, not a branch: times 1 a score keeps its bits and its gradient.
-    return jnp.where(is_sound, 1.0, jnp.nan)
+    return jnp.where(is_valid, 1.0, jnp.nan)
 
 
 def is_rigid(T: Float[Array, "4 4"]) -> Bool[Array, ""]:

@@ -195,8 +195,8 @@ def observe_points(
     if not 0.0 < reach < np.inf:
         raise InputError(f"max_range must be positive and finite [m], got {max_range}")
     begins = np.broadcast_to(begins, ends.shape)
-    is_sound = np.isfinite(ends).all(axis=1) & np.isfinite(begins).all(axis=1)
-    grid = integrate_rays(planner.grid, ends[is_sound], begins[is_sound], reach)
+    is_valid = np.isfinite(ends).all(axis=1) & np.isfinite(begins).all(axis=1)
+    grid = integrate_rays(planner.grid, ends[is_valid], begins[is_valid], reach)
     return replace(planner, grid=grid)
 
 

@@ -31,8 +31,8 @@ def _voxel_renderability(
     state: MapState, camera_position: Float[Array, " 3"], focal: Float[Array, ""], forms: Forms
 ) -> Renderability:
     positive = jnp.stack([focal, state.voxel_size])
-    is_sound = jnp.all(jnp.isfinite(positive) & (positive > 0.0))
-    position = jnp.where(is_sound, camera_position, jnp.nan)
+    is_valid = jnp.all(jnp.isfinite(positive) & (positive > 0.0))
+    position = jnp.where(is_valid, camera_position, jnp.nan)
     return terms_of_rows(state, position, focal, forms)
 
 

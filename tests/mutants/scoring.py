@@ -44,7 +44,7 @@ MUTANTS = [
         "r3jax/kernels/visibility/near.py",
         "tests/scoring/test_kernel_faults.py::test_the_laws_hold[in_images]",
         ("= np.inf, np.nan", "= np.inf, np.inf"),
-        ("if is_sound[view]:", "if view == 0:"),
+        ("if is_valid[view]:", "if view == 0:"),
         ("_MARGIN = np.float32(4.0)", "_MARGIN = np.float32(-8.0)"),
     ),
     *faults(

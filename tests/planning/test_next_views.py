@@ -142,5 +142,5 @@ def test_what_cannot_be_chosen_from_is_refused():
     with pytest.raises(ValueError, match=r"pose 2: .*not finite"):
         ask(1, poses=poses)
     unknown = eqx.tree_at(lambda g: g.log_odds, grid, jnp.zeros_like(grid.log_odds))
-    with pytest.raises(ValueError, match="no free cell that keeps the safety margin"):
+    with pytest.raises(ValueError, match="no free cell with the safety margin"):
         r3jax.next_views(state, unknown, CAMERA, 1, config=CONFIG)

@@ -125,7 +125,7 @@ def borders_agree(modules: Modules) -> None:
     assert len(set(ring)) == len(ring)
     assert is_outside.all()
     expected = np.stack(wrap(*jnp.asarray([row, column]), jnp.full(len(ring), size)), axis=1)
-    found = [picture.stands_for(*pixel, (size, size), True) for pixel in ring]
+    found = [picture.wrap_pixel(*pixel, (size, size), True) for pixel in ring]
     np.testing.assert_array_equal(found, expected)
 
 

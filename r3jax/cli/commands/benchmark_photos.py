@@ -5,7 +5,7 @@ from typing import Any
 from r3jax.apps.benchmark.photos.choosers import check_chooser
 from r3jax.apps.benchmark.photos.pool import open_pool
 from r3jax.apps.benchmark.photos.protocol import PhotoTerms
-from r3jax.apps.benchmark.photos.records import kept_or_made, record_path, table_rows
+from r3jax.apps.benchmark.photos.records import load_or_compute, record_path, table_rows
 from r3jax.cli.console import Console
 from r3jax.cli.console import Table as ConsoleTable
 from r3jax.cli.options.benchmark import BenchmarkOptions, words
@@ -47,7 +47,7 @@ def run_photos_of(console: Console, options: BenchmarkOptions) -> int:
                         show = lambda what, status=status, title=title: status.update(
                             f"{title}: {what} ..."
                         )
-                        record = kept_or_made(
+                        record = load_or_compute(
                             options.out, pool, name, terms, seed, lpips=network, on_stage=show
                         )
                     records.append(record)

@@ -12,7 +12,7 @@ from numba import prange
 
 from r3jax.geometry.voxels import EMPTY_WORD
 from r3jax.kernels.constants import JOINED, MAX_PROBES
-from r3jax.kernels.mapping.bins import camera_of, is_sound, mark_rows
+from r3jax.kernels.mapping.bins import camera_of, is_valid, mark_rows
 from r3jax.kernels.mapping.group import group_pixels
 from r3jax.kernels.native.compiled import (
     inlined,
@@ -180,7 +180,7 @@ def map_add(rows, mean, frame, bins, lattice, workers, lost):
         lost: written: voxels that found no row [1].
     """
     lost[0], camera = 0, camera_of(frame, rows.voxel_size)
-    if not is_sound(camera):
+    if not is_valid(camera):
         return
     all_keys, all_sums = group_pixels(frame, rows.voxel_size, workers)
     found, voxels = np.empty(JOINED, np.int64), all_keys.shape[0]

@@ -146,7 +146,7 @@ def mark_rows(key, visited, resolution, rows, num, camera, table, lattice):
 
 
 @inlined
-def is_sound(camera):
+def is_valid(camera):
     """Checks a camera and a voxel size: nothing is seen with invalid ones."""
     total = camera.voxel_size + camera.focal + camera.x + camera.y + camera.z
     return (camera.voxel_size > _ZERO) & (abs(total) < _INFINITE)

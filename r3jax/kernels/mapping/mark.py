@@ -9,7 +9,7 @@ import numpy as np
 from numba import prange
 
 from r3jax.geometry.voxels import EMPTY_WORD
-from r3jax.kernels.mapping.bins import camera_of, center_of, is_sound, mark_rows
+from r3jax.kernels.mapping.bins import camera_of, center_of, is_valid, mark_rows
 from r3jax.kernels.native.arithmetic import whole
 from r3jax.kernels.native.compiled import (
     in_wide_vectors,
@@ -102,7 +102,7 @@ def is_camera(frame, camera):
     for axis in range(3):
         for k in range(4):
             total += frame.T_camera_world[axis, k]
-    return math.isfinite(total) & is_sound(camera)
+    return math.isfinite(total) & is_valid(camera)
 
 
 @kernel

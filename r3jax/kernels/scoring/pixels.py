@@ -130,7 +130,7 @@ def _write_rows(keys, layout, none, image):
 
 @kernel
 def _look_share(
-    next_view, views, is_sound, layout, rows, bricks, centers, numbers, forms, lattice, means,
+    next_view, views, is_valid, layout, rows, bricks, centers, numbers, forms, lattice, means,
     images,
 ):  # fmt: skip
     """Looks from one view after the other until none is left to claim."""
@@ -140,9 +140,9 @@ def _look_share(
     runs = np.empty((bricks.spheres.shape[0], 2), np.int64)
     bits = np.empty(((rows.visited.shape[0] + 1) // 2, 1), np.uint64)
     i = claim(next_view)
-    while i < is_sound.shape[0]:
+    while i < is_valid.shape[0]:
         means[i], images[i] = 0.0, none
-        if is_sound[i]:
+        if is_valid[i]:
             view = view_at(views, i)
             num = find_runs(view, layout, rows.voxel_size, bricks, runs)
             _draw(
@@ -157,12 +157,23 @@ def _look_share(
 
 @parallel_kernel
 def _look_all(
-    views, is_sound, layout, rows, bricks, centers, numbers, forms, lattice, workers, means, images
+    views,
+    is_valid,
+    layout,
+    rows,
+    bricks,
+    centers,
+    numbers,
+    forms,
+    lattice,
+    workers,
+    means,
+    images,
 ):
     next_view = np.zeros(1, np.int64)
     for _ in prange(workers):
         _look_share(
-            next_view, views, is_sound, layout, rows, bricks, centers, numbers, forms, lattice,
+            next_view, views, is_valid, layout, rows, bricks, centers, numbers, forms, lattice,
             means, images,
         )  # fmt: skip
 
@@ -181,12 +192,12 @@ def pixels(rows, views, layout, forms, lattice, workers, means, images):
         means: written; of R [P], or 0 if there is room for rows.
         images: written; the rows of the map [P, h w], or without room [P, 0] none.
     """
-    is_sound = sound_views(views, rows.voxel_size)
-    slots, bricks = sorted_slots(rows, views, is_sound, workers)
+    is_valid = sound_views(views, rows.voxel_size)
+    slots, bricks = sorted_slots(rows, views, is_valid, workers)
     num = bricks.starts[bricks.starts.shape[0] - 1]
     centers, numbers = np.empty((3, num), np.float32), np.empty(num, np.int32)
     _gather_centers(slots, rows, workers, centers, numbers)
     _look_all(
-        views, is_sound, layout, rows, bricks, centers, numbers, forms, lattice, workers, means,
+        views, is_valid, layout, rows, bricks, centers, numbers, forms, lattice, workers, means,
         images,
     )  # fmt: skip

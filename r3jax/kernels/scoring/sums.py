@@ -334,7 +334,7 @@ def _sorted_cells(cells):
 
 
 @kernel
-def _near_cells(cells, views, is_sound, layout, voxel_size):
+def _near_cells(cells, views, is_valid, layout, voxel_size):
     """Gathers the unexplored cells that some of a few views may show, in order, in one brick."""
     num = cells.unexplored.shape[0]
     empty = Empty(np.empty((3, num), np.float32), np.empty(num, np.int32))
@@ -342,7 +342,7 @@ def _near_cells(cells, views, is_sound, layout, voxel_size):
     for first in range(0, num, CHUNK):
         end = min(first + CHUNK, num)
         x, y, z = cells.x[first:end], cells.y[first:end], cells.z[first:end]
-        mark_near(views, is_sound, layout, voxel_size, x, y, z, is_near)
+        mark_near(views, is_valid, layout, voxel_size, x, y, z, is_near)
         for i in range(end - first):
             is_near[i] &= np.int32(cells.unexplored[first + i] != 0)
         for j in range(compact(is_near, end - first, chosen)):
@@ -356,7 +356,7 @@ def _near_cells(cells, views, is_sound, layout, voxel_size):
 
 @kernel
 def _sum_share(
-    next_view, views, is_sound, layout, voxel_size, bricks, voxels, cell_bricks, empty,
+    next_view, views, is_valid, layout, voxel_size, bricks, voxels, cell_bricks, empty,
     is_kappa_one, tables, results,
 ):  # fmt: skip
     """Sums over one view after the other until none is left to claim."""
@@ -365,11 +365,11 @@ def _sum_share(
     most = max(bricks.spheres.shape[0], cell_bricks.spheres.shape[0])
     runs = np.empty((most, 2), np.int64)
     i = claim(next_view)
-    while i < is_sound.shape[0]:
+    while i < is_valid.shape[0]:
         counts, row_bits = results.unexplored[i], results.row_bits[i]
         cell_bits = results.cell_bits[i]
         _clear(sums, counts, row_bits, cell_bits)
-        if is_sound[i]:
+        if is_valid[i]:
             view = view_at(views, i)
             num = find_runs(view, layout, voxel_size, bricks, runs)
             _draw(view, layout, voxel_size, runs[:num], voxels.known, scratch, buffer)
@@ -388,13 +388,13 @@ def _sum_share(
 
 @parallel_kernel
 def _sum_all(
-    views, is_sound, layout, voxel_size, bricks, voxels, cell_bricks, empty, is_kappa_one, tables,
+    views, is_valid, layout, voxel_size, bricks, voxels, cell_bricks, empty, is_kappa_one, tables,
     workers, results,
 ):  # fmt: skip
     next_view = np.zeros(1, np.int64)
     for _ in prange(workers):
         _sum_share(
-            next_view, views, is_sound, layout, voxel_size, bricks, voxels, cell_bricks, empty,
+            next_view, views, is_valid, layout, voxel_size, bricks, voxels, cell_bricks, empty,
             is_kappa_one, tables, results,
         )  # fmt: skip
 
@@ -413,14 +413,14 @@ def sums(rows, cells, views, layout, forms, tables, workers, results):
         workers: threads; each takes one view after the other.
         results: written, `Sums`.
     """
-    is_sound = sound_views(views, rows.voxel_size)
-    if is_sound.shape[0] <= MAX_VIEWS:
-        bricks, voxels = near_voxels(rows, views, is_sound, layout, forms, workers)
-        cell_bricks, empty = _near_cells(cells, views, is_sound, layout, rows.voxel_size)
+    is_valid = sound_views(views, rows.voxel_size)
+    if is_valid.shape[0] <= MAX_VIEWS:
+        bricks, voxels = near_voxels(rows, views, is_valid, layout, forms, workers)
+        cell_bricks, empty = _near_cells(cells, views, is_valid, layout, rows.voxel_size)
     else:
-        bricks, voxels = sorted_voxels(rows, views, is_sound, forms, workers)
+        bricks, voxels = sorted_voxels(rows, views, is_valid, forms, workers)
         cell_bricks, empty = _sorted_cells(cells)
     _sum_all(
-        views, is_sound, layout, rows.voxel_size, bricks, voxels, cell_bricks, empty,
+        views, is_valid, layout, rows.voxel_size, bricks, voxels, cell_bricks, empty,
         forms.is_kappa_one, tables, workers, results,
     )  # fmt: skip

@@ -99,9 +99,9 @@ def empty_voxels(num, num_words):
 
 
 @kernel
-def sorted_voxels(rows, views, is_sound, forms, workers):
+def sorted_voxels(rows, views, is_valid, forms, workers):
     """Sorts the voxels that some view may see into bricks, with their observations."""
-    slots, bricks = sorted_slots(rows, views, is_sound, workers)
+    slots, bricks = sorted_slots(rows, views, is_valid, workers)
     voxels = empty_voxels(bricks.starts[bricks.starts.shape[0] - 1], rows.visited.shape[0])
     _gather(slots, bricks, rows, forms, workers, voxels)
     return bricks, voxels
@@ -145,7 +145,7 @@ def _gather(slots, bricks, rows, forms, workers, voxels):
 
 
 @kernel
-def near_voxels(rows, views, is_sound, layout, forms, workers):
+def near_voxels(rows, views, is_valid, layout, forms, workers):
     """Gathers the voxels that some of a few views may see, in the order of the map.
 
     There is one brick for each thread's share of the map.
@@ -153,23 +153,23 @@ def near_voxels(rows, views, is_sound, layout, forms, workers):
     capacity = rows.counts.shape[0]
     voxels = empty_voxels(capacity, rows.visited.shape[0])
     begins, ends = np.empty(workers, np.int64), np.empty(workers, np.int64)
-    _gather_near(rows, views, is_sound, layout, forms, begins, ends, voxels)
+    _gather_near(rows, views, is_valid, layout, forms, begins, ends, voxels)
     return bricks_of_shares(begins, ends, capacity), voxels
 
 
 @parallel_kernel
-def _gather_near(rows, views, is_sound, layout, forms, begins, ends, voxels):
+def _gather_near(rows, views, is_valid, layout, forms, begins, ends, voxels):
     shares, capacity = begins.shape[0], rows.counts.shape[0]
     for share in prange(shares):
         begins[share] = capacity * share // shares
         ends[share] = _gather_share(
-            rows, views, is_sound, layout, forms, begins[share],
+            rows, views, is_valid, layout, forms, begins[share],
             capacity * (share + 1) // shares, voxels,
         )  # fmt: skip
 
 
 @kernel
-def _gather_share(rows, views, is_sound, layout, forms, begin, end, voxels):
+def _gather_share(rows, views, is_valid, layout, forms, begin, end, voxels):
     """Gathers what is known of the rows from `begin` to `end` that some view may show.
 
     Returns:
@@ -181,7 +181,7 @@ def _gather_share(rows, views, is_sound, layout, forms, begin, end, voxels):
         count = min(CHUNK, end - first)
         x, y, z = centers[X, :count], centers[Y, :count], centers[Z, :count]
         _find_centers(rows.key[0, first:], rows.key[1, first:], rows.voxel_size, x, y, z)
-        mark_near(views, is_sound, layout, rows.voxel_size, x, y, z, is_near)
+        mark_near(views, is_valid, layout, rows.voxel_size, x, y, z, is_near)
         for i in range(count):
             is_near[i] &= np.int32(rows.counts[first + i] > _ZERO)
         num = compact(is_near, count, chosen)

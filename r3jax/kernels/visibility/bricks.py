@@ -54,15 +54,15 @@ def _clipped(value):
 
 
 @kernel
-def box_of(views, is_sound, voxel_size):
+def box_of(views, is_valid, voxel_size):
     """Finds the box of voxel indices that the views may see, [2, 3].
 
     The upper indices are included.
     """
     box = np.empty((2, 3), np.int64)
     box[0], box[1] = _LIMIT, -_LIMIT
-    for view in range(is_sound.shape[0]):
-        if is_sound[view]:
+    for view in range(is_valid.shape[0]):
+        if is_valid[view]:
             for axis in range(3):
                 middle, far = np.float64(views.position[view, axis]), views.max_range[view]
                 low = _clipped(math.floor((middle - far) / voxel_size) - 1.0)
@@ -169,19 +169,19 @@ def spheres_round(bricks, dims, low, edge):
 
 
 @kernel
-def sorted_slots(rows, views, is_sound, workers):
+def sorted_slots(rows, views, is_valid, workers):
     """Sorts the rows that some view may see into bricks.
 
     Args:
         rows: of the map.
         views: which.
-        is_sound: False for views that see nothing.
+        is_valid: False for views that see nothing.
         workers: threads.
 
     Returns:
         The slot of every row [N], -1 for those out of range, and the bricks that share the slots.
     """
-    box = box_of(views, is_sound, rows.voxel_size)
+    box = box_of(views, is_valid, rows.voxel_size)
     shift, dims = divide(box)
     num_bricks = dims[0] * dims[1] * dims[2]
     counts = np.empty((workers, num_bricks), np.int32)

@@ -27,12 +27,12 @@ def _mark_in_view(bounds, voxel_size, x, y, z, is_near):
 
 
 @kernel
-def mark_near(views, is_sound, layout, voxel_size, x, y, z, is_near):
+def mark_near(views, is_valid, layout, voxel_size, x, y, z, is_near):
     """Marks points [m] that may appear in some view: 1, else 0."""
     for i in range(x.shape[0]):
         is_near[i] = 0
-    for view in range(is_sound.shape[0]):
-        if is_sound[view]:
+    for view in range(is_valid.shape[0]):
+        if is_valid[view]:
             bounds = bounds_of(view_at(views, view), layout)
             _mark_in_view(bounds, voxel_size, x, y, z, is_near)
 

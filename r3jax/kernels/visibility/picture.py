@@ -68,7 +68,7 @@ def shape_of(shape, level):
 
 
 @inlined
-def stands_for(row, column, shape, wraps):
+def wrap_pixel(row, column, shape, wraps):
     """Maps a pixel just outside the image to where it continues (`visibility.views.wrap`).
 
     On an octahedral map, whose borders are glued to themselves, the one that it is glued to; in
@@ -99,7 +99,7 @@ def fold_ring(pixels, begin, stride, shape):
     """Takes what was written one step outside of an octahedral map over into it."""
     for i in range(2 * (shape[0] + shape[1] + 2)):
         row, column = _ring_pixel(i, shape)
-        to_row, to_column = stands_for(row, column, shape, True)
+        to_row, to_column = wrap_pixel(row, column, shape, True)
         at = begin + to_row * stride + to_column
         pixels[at] = min(pixels[at], pixels[begin + row * stride + column])
 
@@ -109,7 +109,7 @@ def fill_ring(pixels, begin, stride, shape, wraps):
     """Writes into the pixels one step outside of an image what they stand for."""
     for i in range(2 * (shape[0] + shape[1] + 2)):
         row, column = _ring_pixel(i, shape)
-        from_row, from_column = stands_for(row, column, shape, wraps)
+        from_row, from_column = wrap_pixel(row, column, shape, wraps)
         pixels[begin + row * stride + column] = pixels[begin + from_row * stride + from_column]
 
 

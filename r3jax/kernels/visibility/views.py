@@ -63,9 +63,9 @@ def view_at(views, i):
 @kernel
 def sound_views(views, voxel_size):
     """Marks the views whose numbers are all finite; the others see nothing."""
-    is_sound = np.empty(views.focal.shape[0], np.bool_)
+    is_valid = np.empty(views.focal.shape[0], np.bool_)
     is_size = voxel_size > _ZERO and voxel_size < _INFINITE
-    for i in range(is_sound.shape[0]):
+    for i in range(is_valid.shape[0]):
         # Differences of infinities are NaN, and what is added to NaN stays NaN.
         total = views.fx[i] + views.fy[i] + views.cx[i] + views.cy[i] + views.focal[i]
         total += views.max_range[i] + views.tolerance[i] + views.pixel_angle[i]
@@ -73,8 +73,8 @@ def sound_views(views, voxel_size):
             total += views.position[i, axis]
         for k in range(9):
             total += views.rotation[i, k]
-        is_sound[i] = is_size and math.isfinite(total)
-    return is_sound
+        is_valid[i] = is_size and math.isfinite(total)
+    return is_valid
 
 
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)

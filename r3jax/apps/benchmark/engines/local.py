@@ -55,7 +55,7 @@ def run_here(cells: Sequence[Cell], root: Path, report: Report) -> None:
         try:
             run_cell(cell, root, lambda stage, cell=cell: report(Event(cell, "stage", stage)))
         except Exception as error:
-            report(Event(cell, "failed", in_words(error)))
+            report(Event(cell, "failed", describe_error(error)))
         else:
             report(Event(cell, "done"))
 
@@ -148,7 +148,7 @@ def _death(exit_code: int) -> str:
     return f"its process ended with code {exit_code}"
 
 
-def in_words(error: BaseException) -> str:
+def describe_error(error: BaseException) -> str:
     """Formats an error in one line."""
     return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
@@ -194,7 +194,7 @@ def _outcome(cell: Cell, root: Path, pipe: Connection) -> tuple[str, str]:
 
         run_cell(cell, root, on_stage)
     except Exception as error:
-        return "failed", in_words(error)
+        return "failed", describe_error(error)
     return "done", ""
 
 

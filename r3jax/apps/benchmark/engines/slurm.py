@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from r3jax.apps.benchmark.cells import Cell, snapshots_left
-from r3jax.apps.benchmark.engines.local import Event, Report, in_words
+from r3jax.apps.benchmark.engines.local import Event, Report, describe_error
 
 _ENDED = {
     "BOOT_FAIL",
@@ -103,7 +103,7 @@ class CellJob:
         try:
             run_cell(cell, root)
         except Exception as error:
-            return in_words(error)
+            return describe_error(error)
         return ""
 
     def checkpoint(self, cell: Cell, root: Path) -> Any:
@@ -185,7 +185,7 @@ def _wait_for(
 
 def _end_of(cell: Cell, job: Any) -> Event:
     error = job.exception()  # of the job itself: out of time too often, ...
-    reason = job.result() if error is None else in_words(error)
+    reason = job.result() if error is None else describe_error(error)
     return Event(cell, "failed", f"job {job.job_id}: {reason}") if reason else Event(cell, "done")
 
 

@@ -32,7 +32,7 @@ def record_path(root: Path, pool: PhotoPool, chooser: str, seed: int) -> Path:
     return root / "photos" / f"{pool.name}-{chooser}-seed{seed}.json"
 
 
-def kept_or_made(
+def load_or_compute(
     root: Path,
     pool: PhotoPool,
     chooser: str,

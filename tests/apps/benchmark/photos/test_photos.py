@@ -16,7 +16,7 @@ from r3jax.apps.benchmark.photos.pool import (
     open_pool,
 )
 from r3jax.apps.benchmark.photos.protocol import PhotoTerms, run_photos
-from r3jax.apps.benchmark.photos.records import kept_or_made, record_path, table_rows
+from r3jax.apps.benchmark.photos.records import load_or_compute, record_path, table_rows
 from r3jax.cli.main import main
 from r3jax.splatting.scene import GaussianScene
 from r3jax.validation.json_text import unsealed
@@ -163,7 +163,7 @@ def test_who_looks_at_the_model_joins_by_name(pool, monkeypatch, tmp_path):
         make_chooser("frontier", 3, 5.0)
     monkeypatch.setitem(choosers.MODEL_CHOOSERS, "spy", Spy)
     check_chooser("spy")
-    record = kept_or_made(tmp_path, pool, "spy", TERMS, 0)
+    record = load_or_compute(tmp_path, pool, "spy", TERMS, 0)
     assert record["chooser"] == "spy"
     assert unsealed(json.loads(record_path(tmp_path, pool, "spy", 0).read_text())) == record
 
@@ -188,15 +188,15 @@ def test_a_record_is_made_once_on_equal_terms(pool, tmp_path, monkeypatch):
     made = []
     outcome = run_photos(pool, make_chooser("random", 3, 5.0), TERMS, seed=0)
     monkeypatch.setattr(records, "run_photos", lambda *a, **k: made.append(a[2]) or outcome)
-    first = kept_or_made(tmp_path, pool, "random", TERMS, 0)
-    assert kept_or_made(tmp_path, pool, "random", TERMS, 0) == first
+    first = load_or_compute(tmp_path, pool, "random", TERMS, 0)
+    assert load_or_compute(tmp_path, pool, "random", TERMS, 0) == first
     assert len(made) == 1
     longer = dataclasses.replace(TERMS, iterations=20)
-    assert kept_or_made(tmp_path, pool, "random", longer, 0)["terms"]["iterations"] == 20
+    assert load_or_compute(tmp_path, pool, "random", longer, 0)["terms"]["iterations"] == 20
     path = record_path(tmp_path, pool, "random", 0)
     for damage in (lambda text: "{", lambda text: text.replace('"psnr": [', '"psnr": [9', 1)):
         path.write_text(damage(path.read_text()))
-        kept_or_made(tmp_path, pool, "random", TERMS, 0)
+        load_or_compute(tmp_path, pool, "random", TERMS, 0)
     assert made == [TERMS, longer, TERMS, TERMS]
 
 
