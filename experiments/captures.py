@@ -1,7 +1,7 @@
-"""Compares capturing while moving, gaze, spacing and training length at equal time or views.
+"""Compares capturing while moving, rivals, and the spacing of frames at equal time or views.
 
     python -m experiments.captures modes --size small --scenes flat office --seeds 0
-    python -m experiments.captures gaze --size small --scenes flat office --seeds 0
+    python -m experiments.captures spacing --size small --seeds 0 1 2 --snapshots 30 60
     python -m experiments.captures rivals --size small --budget views --snapshots 30
 
 A table is a list of rows, each a policy under settings that differ from the suite's, and each is
@@ -10,7 +10,7 @@ decision 0.3 s, one reconsidered on arrival 0.05 s, a frame 0.02 s, a gaze 0.01 
 nothing; or, with `--clock wall`, what all of this takes on this machine, which then has nothing
 else to do. Policies that do not capture or plan while moving fly as published. With `--budget
 views` the views that a policy chose are counted; frames captured while moving come on top. What is
-done in `--work` is not done again, and what differs in its training only is not flown again.
+done in `--work` is not done again.
 
 Beside a table lie its records, and the poses of flights that no machine flies twice alike. So
 another machine, or another day, adds a seed:
@@ -18,7 +18,6 @@ another machine, or another day, adds a seed:
     python -m experiments.captures rivals --size small --seeds 0 1 2 --kept rivals_records.jsonl
 """
 
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -40,7 +39,7 @@ from experiments.pages.benchmark_figures import curve_figure
 from experiments.pages.comparison_tables import ause_of_renderability
 from experiments.suite import Options as SuiteOptions
 from experiments.suite import Records, origin, request_of, run_cells, take_over
-from r3jax.apps.benchmark.cells import Cell, paths_of, snapshots_left
+from r3jax.apps.benchmark.cells import Cell, paths_of
 from r3jax.apps.benchmark.plan import make_plan
 from r3jax.apps.benchmark.record import read_records, write_records
 from r3jax.apps.benchmark.tables import metric_named
@@ -56,7 +55,7 @@ from r3jax.runs.reader import read_run
 
 NAME = "captures"
 
-TableName = Literal["modes", "rivals", "gaze", "spacing", "horizon", "turning", "r3con", "training"]
+TableName = Literal["modes", "rivals", "spacing"]
 
 
 @dataclass(frozen=True)
@@ -69,14 +68,8 @@ class Row:
     against: str = ""
     """The row whose scores are subtracted; empty: none."""
 
-    planner: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    """Settings of the policy that differ from its defaults (`Request.settings`)."""
-
     loop: Mapping[str, Any] = field(default_factory=dict[str, Any])
     """Settings of the mission that differ from the suite's (`Conditions.loop`)."""
-
-    training: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    """Fields of `Conditions` that concern the training, where they differ from the suite's."""
 
 
 REFERENCE = "active-gs"
@@ -101,87 +94,32 @@ MODES: dict[str, dict[str, Any]] = {
 LONG: dict[str, Any] = {"iterations": 6000}
 """A training that does not punish a policy for its many frames, as the suite's does."""
 
-LENGTHS: dict[str, dict[str, Any]] = {
-    "1500 iterations": {},
-    "6000 iterations": LONG,
-    "6000 iterations, 80,000 Gaussians": {"iterations": 6000, "capacity": 80_000},
-    "MCMC, 7000 iterations at 256 px": {
-        "iterations": 7000,
-        "train_resolution": 256,
-        "trainer": {"strategy": "mcmc"},
-    },
-}
-"""Trainings: the suite's, a longer one, one that may also grow further, and another trainer's."""
-
 
 TABLES: dict[TableName, dict[str, Row]] = {
     # Every policy blind between its views, with captures, and planning while it moves.
     "modes": {
-        policy + mode: Row(policy, REFERENCE, loop=loop, training=LONG)
+        policy + mode: Row(policy, REFERENCE, loop=loop)
         for policy in POLICIES
         for mode, loop in MODES.items()
     },
     # Rivals, most with a map of their own: at what it costs here with `--clock wall`, else as if
     # it took no longer than ours.
     "rivals": {
-        OURS: Row("r3-ahead", loop=ON_THE_WAY, training=LONG),
+        OURS: Row("r3-ahead", loop=ON_THE_WAY),
         **{
-            policy + mode: Row(policy, OURS, loop=loop, training=LONG)
+            policy + mode: Row(policy, OURS, loop=loop)
             for policy in (REFERENCE, "gavis", "active-gs-online", "fisherrf", "gauss-mi")
             for mode, loop in MODES.items()
         },
     },
-    # Where the camera looks while moving.
-    "gaze": {
-        gaze: Row("r3-ahead", "panorama", loop=ON_THE_WAY | {"gaze": gaze})
-        for gaze in ("panorama", "ahead")
-    },
     # How often it looks, for ours and for the rival; more frames need longer trainings.
     "spacing": {
-        REFERENCE: Row(REFERENCE, training=LONG),
+        REFERENCE: Row(REFERENCE),
         **{
-            f"{policy}, a frame every {meters} m": Row(policy, REFERENCE, loop=loop, training=LONG)
+            f"{policy}, a frame every {meters} m": Row(policy, REFERENCE, loop=loop)
             for policy in (REFERENCE, "r3-ahead")
             for meters, loop in ((0.3, ON_THE_WAY), (0.15, CLOSE))
         },
-    },
-    # How many views `r3-ahead` plans: one, its four, or as many as MAGICIAN (2603.22650).
-    "horizon": {
-        label: Row("r3-ahead", "4 views, a beam of 4", planner, CLOSE, LONG)
-        for label, planner in {
-            "1 view": {"horizon": 1},
-            "4 views, a beam of 4": {},  # as it is
-            "10 views, a beam of 10": {"horizon": 10, "beam": 10},
-        }.items()
-    },
-    # A camera that turns at most 90 degrees a second, instead of in no time.
-    "turning": {
-        policy + mode: Row(
-            policy, REFERENCE, {"motion": {"speed": 1.0, "turn_rate": 90.0}}, MODES[mode], LONG
-        )
-        for policy in (REFERENCE, "r3-ahead")
-        for mode in ("", ", captures, plans on the way")
-    },
-    # The rule of the paper's own code, and each of its parts exchanged for that of `r3-pano`.
-    "r3con": {
-        "r3con": Row("r3con", "r3-pano"),
-        "r3con, 16 for a cell instead of 1000": Row("r3con", "r3con", {"cell_weight": 16.0}),
-        "r3con, path weight 0.5 instead of adaptive": Row("r3con", "r3con", {"path_weight": 0.5}),
-        "r3con, utility of the view instead of all round": Row(
-            "r3con", "r3con", {"all_round": False}
-        ),
-        "r3-pano": Row("r3-pano"),
-        "r3-pano, candidates of r3con": Row(
-            "r3-pano", "r3-pano", {"num_candidates": 50, "radius": 2.0, "num_frontier": 0}
-        ),
-    },
-    # The same flights, trained for longer.
-    "training": {
-        f"{policy}{mode}, {length}": Row(
-            policy, f"{REFERENCE}, {length}", loop=MODES[mode], training=training
-        )
-        for length, training in LENGTHS.items()
-        for policy, mode in ((REFERENCE, ""), ("r3-ahead", ", captures, plans on the way"))
     },
 }
 
@@ -232,7 +170,7 @@ def main(options: Options) -> Path:
     cells = {label: cells_of(options, row, root) for label, row in rows.items()}
     every = [cell for own in cells.values() for cell in own]
     take_over(options.kept, root, every)
-    run_in_turn(every, root, options)
+    run_cells(every, root, engine=options.engine, jobs=options.jobs)
     found = {label: records_of(root, own) for label, own in cells.items()}
     write_records(folder / options.records, [record for own in found.values() for record in own])
     records = [as_line(record, label, rows) for label, own in found.items() for record in own]
@@ -267,41 +205,8 @@ def rows_of(options: Options) -> dict[str, Row]:
 def cells_of(options: Options, row: Row, root: Path) -> list[Cell]:
     """Returns a row's cells: every scene and seed."""
     request = request_of(replace(options, policies=(row.policy,)), options.budget)
-    conditions = replace(
-        request.conditions, clock=options.clock, loop=dict(row.loop), **row.training
-    )
-    asked = replace(request, conditions=conditions, settings=dict(row.planner))
-    return list(make_plan(asked, root))
-
-
-def run_in_turn(cells: Sequence[Cell], root: Path, options: Options) -> None:
-    """Runs cells; one that differs in its training only from another takes over its flight."""
-    unique = {cell.identity_hash: cell for cell in cells}
-    flown: dict[str, Cell] = {}
-    for cell in unique.values():
-        if not (paths_of(root, cell).run.exists() or snapshots_left(root, cell)):
-            continue  # done elsewhere
-        first = flown.setdefault(_flight(cell), cell)
-        run, other = paths_of(root, cell).run, paths_of(root, first).run
-        if first is not cell and not run.exists():
-            run_cells([first], root, engine=options.engine, jobs=options.jobs)
-            # Under another name first: whatever has its right name is whole.
-            half = run.with_name("run-copied")
-            shutil.rmtree(half, ignore_errors=True)
-            shutil.copytree(other, half, ignore=shutil.ignore_patterns("models"))
-            half.rename(run)
-    run_cells(list(unique.values()), root, engine=options.engine, jobs=options.jobs)
-
-
-def _flight(cell: Cell) -> str:
-    """Returns what the exploration depends on.
-
-    The same for cells that differ in their training only.
-    """
-    conditions = replace(
-        cell.conditions, train_resolution=16, iterations=1, gaussians=1, capacity=1, trainer={}
-    )
-    return replace(cell, conditions=conditions).identity_hash
+    conditions = replace(request.conditions, clock=options.clock, loop=dict(row.loop), **LONG)
+    return list(make_plan(replace(request, conditions=conditions), root))
 
 
 def records_of(root: Path, cells: Sequence[Cell]) -> list[dict[str, Any]]:
@@ -312,12 +217,9 @@ def records_of(root: Path, cells: Sequence[Cell]) -> list[dict[str, Any]]:
 
 def as_line(record: Mapping[str, Any], label: str, rows: Mapping[str, Row]) -> dict[str, Any]:
     """Returns a record under its row's name; what rows differ in on purpose is no unequal term."""
-    compared = {name for row in rows.values() for name in (*row.loop, *row.training)}
-    parts = {
-        part: {name: value for name, value in record[part].items() if name not in compared}
-        for part in ("sensing", "training")
-    }
-    return {**record, **parts, "policy": label, "settings": {}}
+    compared = {name for row in rows.values() for name in row.loop}
+    sensing = {name: value for name, value in record["sensing"].items() if name not in compared}
+    return {**record, "sensing": sensing, "policy": label, "settings": {}}
 
 
 def cost_rows(root: Path, cells: Mapping[str, Sequence[Cell]]) -> list[dict[str, str]]:
@@ -347,12 +249,9 @@ def write_page(
     """Writes a table for every snapshot, differences from the rows' references, and costs."""
     records = with_short_names(records)
     page: list[str] = []
-    trainings = {str(row.training): row.training for row in rows.values()}
     for snapshot in snapshots_of(records):
         now = [record for record in records if record["snapshot"] == snapshot]
-        # Rows are compared with rows of the same training only; another may ask for other images.
-        for training in trainings.values():
-            check_equal_terms([r for r in now if rows[r["policy"]].training == training])
+        check_equal_terms(now)
         lines = quality_rows(rows, now)
         write_csv(folder / f"{name}_{snapshot.replace(':', '_')}.csv", lines, source)
         page += [
@@ -366,8 +265,8 @@ def write_page(
             "**What this took here**, medians in seconds; a decision with the part that was hidden",
             markdown_table(costs),
         ]
-    # Models of other trainings are no points of one curve, and two points are none at all.
-    if len(trainings) == 1 and len(rows) * len(snapshots_of(records)) > 2:
+    # Two points are no curve.
+    if len(rows) * len(snapshots_of(records)) > 2:
         write_figure(folder / f"{name}_by_frames.png", frames_figure(records), source)
         page.append(f"![PSNR against the number of frames]({name}_by_frames.png)")
     write_markdown(folder / f"{name}.md", page, source)

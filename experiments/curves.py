@@ -5,9 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from experiments.rank_statistics import with_interval
 from r3jax.evaluation.comparison import Cell, snapshots_of, view_values
-from r3jax.evaluation.statistics import RESAMPLES, Estimate
 
 EXPLORATION = {
     "views": "views",
@@ -89,24 +87,6 @@ def sparsification(quality: np.ndarray, error: np.ndarray) -> Sparsification:
 def _mean_of_rest(error: np.ndarray) -> np.ndarray:
     """Returns the mean of error[k:] for every k."""
     return np.cumsum(error[::-1])[::-1] / np.arange(len(error), 0, -1)
-
-
-def ause(
-    quality: np.ndarray,
-    error: np.ndarray,
-    *,
-    strata: np.ndarray | None = None,
-    seed: int = 0,
-    resamples: int = RESAMPLES,
-) -> Estimate:
-    """Returns `Sparsification.relative` (0 perfect, 1 chance) with an interval over views.
-
-    Arguments as in `sparsification` and `rank_statistics.spearman`; views with a NaN are left out.
-    """
-    return with_interval(
-        lambda q, e: sparsification(q, e).relative, (quality, error),
-        strata=strata, seed=seed, resamples=resamples,
-    )  # fmt: skip
 
 
 def area_under(

@@ -7,7 +7,7 @@ of a resample are evaluated by the same drawn views, and an exploration (policy 
 its snapshots along, which share their first frames. Drawing models x views one by one would take a
 hundred views evaluated fifty times for five thousand independent ones.
 
-A resample is a row of weights, how often it holds each view: ranks, correlations and areas have
+A resample is a row of weights, how often it holds each view: ranks and correlations have
 closed forms in them, so that a thousand resamples are a few array operations. The first row holds
 every view once: the sample itself.
 
@@ -49,27 +49,23 @@ def draw(
     return Draws(weights(num_views), weights(num_explorations))
 
 
-def mean_over_models(
-    samples: np.ndarray, explorations: np.ndarray, draws: Draws, *, models: np.ndarray | None = None
-) -> Estimate:
+def mean_over_models(samples: np.ndarray, explorations: np.ndarray, draws: Draws) -> Estimate:
     """Returns the mean over models of a statistic, with its interval; NaN are left out.
 
     Args:
         samples: the statistic of every model and draw, [M, D].
         explorations: number of each model's exploration, [M].
         draws: that made the samples.
-        models: mask of the models that count, [M]; all by default.
 
     Returns:
         The estimate; its count is the number of models. NaN where no model has a value, and
         without an interval where most draws have none.
     """
-    chosen = np.ones(len(samples), bool) if models is None else models
-    weights = draws.explorations[:, explorations[chosen]].T * ~np.isnan(samples[chosen])
-    total, num = np.nansum(weights * samples[chosen], axis=0), weights.sum(axis=0)
+    weights = draws.explorations[:, explorations].T * ~np.isnan(samples)
+    total, num = np.nansum(weights * samples, axis=0), weights.sum(axis=0)
     means = np.where(num > 0.0, total / np.maximum(num, 1.0), np.nan)
     known = means[1:][~np.isnan(means[1:])]
-    count = int(np.sum(~np.isnan(samples[chosen, 0])))
+    count = int(np.sum(~np.isnan(samples[:, 0])))
     if np.isnan(means[0]) or 2 * len(known) < len(means) - 1 or len(known) == 0:
         return Estimate(float(means[0]), np.nan, np.nan, count)
     low, high = np.percentile(known, LEVEL)
@@ -130,51 +126,3 @@ def partial_spearman(
     is_left = np.minimum(1.0 - xz**2, 1.0 - yz**2) > _NOTHING_LEFT
     found = (xy - xz * yz) / np.sqrt(np.where(is_left, left, 1.0))
     return np.where(is_left, np.clip(found, -1.0, 1.0), np.nan)
-
-
-def kendall(x: np.ndarray, y: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Returns Kendall's tau-b of two columns [V] in every draw, [D]."""
-    (x, y), weights = _known(weights, (x, y))
-    signs = [np.sign(column[:, None] - column[None, :]) for column in (x, y)]
-    pairs = lambda matrix: np.einsum("dv,dv->d", weights @ matrix, weights)
-    both = pairs(signs[0] * signs[1])
-    untied = pairs(np.abs(signs[0])) * pairs(np.abs(signs[1]))
-    return np.where(untied > 0.0, both / np.sqrt(np.maximum(untied, 1.0)), np.nan)
-
-
-def ause(quality: np.ndarray, error: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Returns `evaluation.areas.Sparsification.relative` in every draw, [D]: 0 perfect, 1 chance.
-
-    Args:
-        quality: predicted, [V], higher is better.
-        error: measured, [V], lower is better.
-        weights: of the draws, [D, V].
-    """
-    (quality, error), weights = _known(weights, (quality, error))
-    area = _mean_of_rest(quality, error, weights)
-    oracle = _mean_of_rest(-error, error, weights)
-    mean = (weights * error).sum(axis=1) / np.maximum(weights.sum(axis=1), 1.0)
-    chance = mean - oracle
-    is_defined = chance > 1e-12 * (1.0 + np.abs(mean))
-    return np.where(is_defined, (area - oracle) / np.where(is_defined, chance, 1.0), np.nan)
-
-
-def _mean_of_rest(quality: np.ndarray, error: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Returns the mean over k of the mean error of the n - k views predicted best, [D].
-
-    Where w equal errors e leave one by one and N views with the sum S stay behind them, their
-    part is the sum over j = 1 ... w of (S + j e) / (N + j) = w e + (S - N e) (H(N + w) - H(N)),
-    with H the harmonic numbers.
-    """
-    _, level = np.unique(quality, return_inverse=True)
-    order = np.argsort(level, kind="stable")
-    starts = np.flatnonzero(np.diff(level[order], prepend=-1))
-    by_level = lambda a: np.add.reduceat(a[:, order], starts, axis=1)
-    drawn = by_level(weights)
-    e = by_level(weights * error[None]) / np.maximum(drawn, 1.0)  # views of one level leave alike
-    after = lambda a: np.cumsum(a[:, ::-1], axis=1)[:, ::-1] - a
-    behind, rest = after(drawn), after(drawn * e)
-    total = drawn.sum(axis=1)
-    harmonic = np.concatenate([[0.0], np.cumsum(1.0 / np.arange(1, int(total.max()) + 1))])
-    steps = harmonic[(behind + drawn).astype(int)] - harmonic[behind.astype(int)]
-    return (drawn * e + (rest - behind * e) * steps).sum(axis=1) / np.maximum(total, 1.0)

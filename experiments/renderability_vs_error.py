@@ -1,30 +1,31 @@
-"""Does renderability track the error? Views of many models: rank correlations, areas, terms.
+"""Does renderability track the error? Rank correlations over the test views of many models.
 
     python -m experiments.renderability_vs_error --size smoke
 
-The cells are those of `experiments.replica_dense_views`; for each trained model the map of its
-recorded frames is made again, and every term of renderability taken apart.
+The cells are those of `experiments.replica_dense_views`. R of every test view is in their records;
+coverage, the share of pixels that show a voxel, is computed from the map of the frames that the
+model was trained on. Correlations are computed within a model and averaged over models.
+
+Shape symbols: M models of a scene; V its test views; D draws (`error_statistics`).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import tyro
+from matplotlib.figure import Figure
 
-from experiments.error_analysis import (
-    COVER,
-    COVERAGE,
-    ERRORS,
-    SCORE,
-    SEEN_ERROR,
-    SceneModels,
-    correlation_rows,
-    scene_models,
-    snapshots_of_models,
+from experiments.error_statistics import (
+    Draws,
+    draw,
+    mean_over_models,
+    partial_spearman,
+    spearman,
 )
-from experiments.error_terms import PRODUCTS, SMALLEST_SHARE, column
 from experiments.pages.artifacts import (
     Origin,
     markdown_table,
@@ -32,184 +33,197 @@ from experiments.pages.artifacts import (
     write_figure,
     write_markdown,
 )
-from experiments.pages.error_figures import (
-    TITLES,
-    budget_name,
-    distribution_figure,
-    model_figure,
-    scatter_figure,
-    term_figure,
-    told,
-)
-from experiments.suite import Options, origin, run_suite
-from r3jax.apps.benchmark.record import source_commit
+from experiments.pages.policy_style import OKABE_ITO, legend_below
+from experiments.suite import Options, Records, origin, run_suite
+from r3jax.apps.benchmark.cells import Conditions
+from r3jax.apps.benchmark.reference_images import read_reference_images, reference_path
 from r3jax.apps.benchmark.tables import notes
+from r3jax.apps.forecast.forecast import view_features
+from r3jax.evaluation.comparison import (
+    check_equal_terms,
+    method_name,
+    scenes_of,
+    view_values,
+    with_short_names,
+)
+from r3jax.evaluation.maps import map_of
+from r3jax.evaluation.statistics import RESAMPLES, Estimate
+from r3jax.plots import style
+from r3jax.runs.reader import read_run
+from r3jax.scoring.config import ScoringConfig
 
 NAME = "renderability_vs_error"
 
-_VIEW_COLUMNS = (
-    SCORE, COVERAGE, COVER, *(name for name in PRODUCTS if name != SCORE), "psnr", "ssim", "lpips",
-    SEEN_ERROR, "seen_share",
-)  # fmt: skip
-"""What `views.csv` holds of every view."""
+ERRORS = {"psnr": "PSNR [dB]", "ssim": "SSIM", "lpips": "LPIPS"}
+"""Measured errors, by column."""
+
+
+@dataclass(frozen=True)
+class SceneModels:
+    """The models of one scene."""
+
+    scene: str
+
+    models: tuple[dict[str, Any], ...]
+    """Method, seed and snapshot of each model, [M]."""
+
+    columns: Mapping[str, np.ndarray]
+    """`R`, `coverage` and measured errors, [M, V]; NaN where there is none."""
+
+    draws: Draws
+
+    @property
+    def explorations(self) -> np.ndarray:
+        """Number of each model's exploration (method and seed), [M]."""
+        names = [(model["method"], model["seed"]) for model in self.models]
+        order = {name: number for number, name in enumerate(dict.fromkeys(names))}
+        return np.array([order[name] for name in names])
+
+    def correlations(self, predictor: str, error: str, given: str = "") -> np.ndarray:
+        """Returns Spearman's correlation for every model and draw, [M, D].
+
+        LPIPS changes its sign, so that a positive correlation is always a right prediction.
+
+        Args:
+            predictor: `R` or `coverage`.
+            error: of `ERRORS`.
+            given: a prediction that is known already: then the partial correlation.
+        """
+        sign, weights = (-1.0 if error == "lpips" else 1.0), self.draws.views
+        x, y = self.columns[predictor], sign * self.columns[error]
+        if not given:
+            return np.stack([spearman(a, b, weights) for a, b in zip(x, y, strict=True)])
+        parts = zip(x, y, self.columns[given], strict=True)
+        return np.stack([partial_spearman(a, b, c, weights) for a, b, c in parts])
+
+    def estimate(self, predictor: str, error: str, given: str = "") -> Estimate:
+        """Returns the mean over models of `correlations`, with its interval."""
+        found = self.correlations(predictor, error, given)
+        return mean_over_models(found, self.explorations, self.draws)
 
 
 def main(options: Options) -> Path:
     """Runs the cells, compares, and returns the folder of the results."""
     root, records = run_suite(options, "views")
     folder = options.out / NAME / options.size
-    scenes = list(scene_models(root, records))
-    terms = (*notes(records), f"Compared at commit {source_commit() or 'unknown'}.")
-    write_page(folder, scenes, terms, origin(f"experiments.{NAME}", records))
+    check_equal_terms(records, one_snapshot=False)
+    coverage = [coverage_of(root, record) for record in records]
+    scenes = scene_models(with_short_names(records), coverage)
+    write_page(folder, scenes, notes(records), origin(f"experiments.{NAME}", records))
     print(f"results  {folder}")
     return folder
+
+
+def coverage_of(root: Path, record: Mapping[str, Any]) -> np.ndarray:
+    """Returns the share of each test view's pixels that show a voxel of the training frames, [V].
+
+    Raises:
+        RunError, FileNotFoundError: the cell's files are not there.
+    """
+    sensing = record["sensing"]
+    run = read_run(root / record["run"])
+    frames = [run.frame(step) for step in range(record["exploration"]["views"])]
+    conditions = Conditions(
+        resolution=record["resolution"],
+        fov=sensing["fov"],
+        train_resolution=record["training"]["resolution"],
+    )
+    path = reference_path(root, record["scene_hash"], record["test_views"]["hash"], conditions)
+    poses = jnp.asarray(read_reference_images(path).poses, jnp.float32)
+    state = map_of(frames, voxel_size=sensing["voxel_size"], max_range=sensing["max_range"])
+    return view_features(state, run.camera, poses, ScoringConfig(max_range=sensing["max_range"]))[0]
+
+
+def scene_models(
+    records: Records, coverage: Sequence[np.ndarray], *, resamples: int = RESAMPLES
+) -> list[SceneModels]:
+    """Returns every scene's models from their records and the coverage of their views."""
+    found: list[SceneModels] = []
+    for scene in scenes_of(records):
+        chosen = [i for i, record in enumerate(records) if record["scene"] == scene]
+        columns = {"coverage": np.stack([coverage[i] for i in chosen])}
+        for name in ("R", *ERRORS):
+            field = "renderability" if name == "R" else name
+            values = [view_values(records[i], field) for i in chosen]
+            known = [value for value in values if value is not None]
+            if len(known) == len(values):
+                columns[name] = np.stack(known)
+        models = tuple(
+            {"method": method_name(r), "seed": r["seed"], "snapshot": r["snapshot"]}
+            for r in (records[i] for i in chosen)
+        )
+        num = len({(model["method"], model["seed"]) for model in models})
+        draws = draw(columns["coverage"].shape[1], num, resamples=resamples)
+        found.append(SceneModels(scene, models, columns, draws))
+    return found
 
 
 def write_page(
     folder: Path, scenes: Sequence[SceneModels], terms: Sequence[str], source: Origin
 ) -> None:
-    """Writes all numbers, the pictures, and the page that shows them scene by scene.
-
-    Args:
-        folder: where to.
-        scenes: with their models.
-        terms: sentences on how the models were made.
-        source: command, machine, commit.
-    """
+    """Writes all views, the picture of the models, and a table for each scene."""
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / "views.csv", [row for m in scenes for row in view_rows(m)], source)
-    numbers = [row for models in scenes for row in correlation_rows(models)]
-    write_csv(folder / "correlations.csv", numbers, source)
-    methods = ", ".join(dict.fromkeys(method for m in scenes for method in m.methods))
-    page = ["# Renderability against the error", _READING]
-    page.append(" ".join([_agreement(scenes), f"Models of {methods}.", *terms]))
-    for name, figure in (
-        ("distributions", distribution_figure(scenes)),
-        ("models", model_figure(scenes)),
-    ):
-        write_figure(folder / f"{name}.png", figure, source)
-        page.append(f"![{name}]({name}.png)")
+    write_figure(folder / "models.png", model_figure(scenes), source)
+    page = ["# Renderability against the error", _READING, " ".join(terms)]
+    page.append("![mean R and mean PSNR of every model](models.png)")
     for models in scenes:
-        page.append(f"## {models.scene}")
-        for kind, figure in (("scatter", scatter_figure(models)), ("terms", term_figure(models))):
-            write_figure(folder / f"{kind}-{models.scene}.png", figure, source)
-        page += [
-            markdown_table(list(error_rows(models))),
-            f"![views]({f'scatter-{models.scene}.png'})",
-            "By budget (PSNR of all pixels; last column: of seen pixels, by seen voxels):",
-            markdown_table(list(budget_rows(models))),
-            "Term by term (Spearman with PSNR):",
-            markdown_table(list(term_rows(models))),
-            f"![terms]({f'terms-{models.scene}.png'})",
-        ]
+        page += [f"## {models.scene}", markdown_table(list(error_rows(models)))]
     write_markdown(folder / f"{NAME}.md", page, source)
 
 
-_READING = f"""\
-Renderability R of a test view is the mean over the pixels of the map's depth buffer (at most
-128 x 128) of the R of the voxel that each pixel shows; **a pixel without a voxel counts 0**. The
-map holds the recorded frames that the model was trained on, and no others. *Coverage* is the share
-of pixels that show a voxel: what is left of R when every voxel is as good as any. *Terms* are
-means of the same kind, each of one factor of R (or the product of two) alone; *kappa = 1* leaves
-the box test out of all factors. *COVER* is the mean of (1 + cos) / 2 to the nearest seen direction.
-
-**Seen pixels** are those of the test view whose surface some training frame has looked at: the
-true point lies within the sensor's range and no more than a voxel behind what the frame measured.
-The map has no say in it. PSNR on seen pixels is of these alone (views with less than
-{100 * SMALLEST_SHARE:.0f} % of them are left out), and is held against means over the pixels that
-show a voxel, so that coverage is in neither: what a term predicts there is its own. *Holes of the
-scan left out* is another thing: pixels where the true depth is unknown.
-
-Coefficients are computed within a model (one scene, policy, seed and budget), over its test views,
-and averaged over models; scenes are never mixed. LPIPS changes its sign: positive is right. *Given
-the other* is Spearman's partial correlation of R given coverage, and of coverage given R. AUSE is
-the area between the sparsification curve and the oracle's over that of chance: 0 perfect, 1 chance.
-Brackets are 95 % intervals of a bootstrap over test views and over explorations (policy and seed),
-drawn independently: the same hard views are hard for all models, and the budgets of one exploration
-share frames. So an interval says what other views of the scene and other runs might have given."""
-
-
-def _agreement(scenes: Sequence[SceneModels]) -> str:
-    """Returns whether what was computed here is what the benchmark has recorded."""
-    columns = [models.columns for models in scenes]
-    score = max(np.nanmax(np.abs(c[SCORE] - c["renderability"])) for c in columns)
-    psnr = max(np.nanmax(np.abs(c["psnr"] - c["psnr_again"])) for c in columns)
-    return (
-        "Computed again from the recorded frames and the stored models, no view's R differs by "
-        f"more than {score:.2g} from the benchmark's record, and no PSNR by more than "
-        f"{psnr:.2g} dB."
-    )
+_READING = """\
+R of a test view is the mean over the pixels of the map's depth buffer of the R of the voxel that
+each shows; a pixel without a voxel counts 0. *Coverage* is the share of pixels that show a voxel.
+Coefficients are computed within a model (one scene, policy, seed and budget) and averaged over
+models. LPIPS changes its sign: positive is right. *Given the other* is Spearman's partial
+correlation. Brackets are 95 % intervals of a bootstrap over test views and explorations, drawn
+independently."""
 
 
 def view_rows(models: SceneModels) -> Iterator[dict[str, Any]]:
     """Yields one row per model and view."""
-    names = [name for name in _VIEW_COLUMNS if name in models.columns]
-    known = zip(models.methods, models.seeds, models.snapshots, strict=True)
-    for m, (method, seed, snapshot) in enumerate(known):
-        model = {"scene": models.scene, "method": method, "seed": seed, "snapshot": snapshot}
-        for v in range(models.columns[SCORE].shape[1]):
-            values = {name: float(models.columns[name][m, v]) for name in names}
+    for m, model in enumerate(models.models):
+        for v in range(models.columns["coverage"].shape[1]):
+            values = {name: float(column[m, v]) for name, column in models.columns.items()}
             rounded = {k: None if np.isnan(x) else round(x, 4) for k, x in values.items()}
-            yield model | {"view": v} | rounded
+            yield {"scene": models.scene} | model | {"view": v} | rounded
 
 
 def error_rows(models: SceneModels) -> Iterator[dict[str, Any]]:
     """Yields R, and coverage beside it, against every error."""
-    for error in models.errors():
-        for predictor, other in ((SCORE, COVERAGE), (COVERAGE, SCORE)):
-            find = lambda statistic, given="", error=error, predictor=predictor: told(
-                models.estimate(statistic, predictor, error, given=given)
-            )
+    for error in (name for name in ERRORS if name in models.columns):
+        for predictor, other in (("R", "coverage"), ("coverage", "R")):
             yield {
                 "error": ERRORS[error],
-                "predicted by": TITLES[predictor],
-                "Spearman": find("spearman"),
-                "Kendall": find("kendall"),
-                "AUSE": find("ause"),
-                "given the other": find("partial", other),
+                "predicted by": predictor,
+                "Spearman": told(models.estimate(predictor, error)),
+                "given the other": told(models.estimate(predictor, error, other)),
             }
 
 
-def budget_rows(models: SceneModels) -> Iterator[dict[str, Any]]:
-    """Yields how it goes with the budget."""
-    for snapshot in snapshots_of_models(models):
-        mine = np.array([name == snapshot for name in models.snapshots])
-        mean = lambda name, mine=mine: float(np.nanmean(models.columns[name][mine]))
-        find = lambda statistic, predictor, error="psnr", given="", snapshot=snapshot: told(
-            models.estimate(statistic, predictor, error, given=given, snapshot=snapshot)
-        )
-        yield {
-            "budget": budget_name(snapshot),
-            "models": int(mine.sum()),
-            "R": mean(SCORE),
-            "coverage": mean(COVERAGE),
-            "PSNR [dB]": mean("psnr"),
-            "Spearman of R": find("spearman", SCORE),
-            "of coverage": find("spearman", COVERAGE),
-            "of R given coverage": find("partial", SCORE, given=COVERAGE),
-            "of R on seen pixels": find("spearman", SCORE, SEEN_ERROR),
-        }
+def told(found: Estimate) -> str:
+    """Returns an estimate with its interval, as tables have it."""
+    if np.isnan(found.value):
+        return "–"
+    if np.isnan(found.low):
+        return f"{found.value:.2f}"
+    return f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]"
 
 
-def term_rows(models: SceneModels) -> Iterator[dict[str, Any]]:
-    """Yields every term, product and rival: what it says, and how much of that is coverage."""
-    for name in (COVERAGE, COVER, *PRODUCTS):
-        plain = column(name, "one") if name in PRODUCTS else ""
-        find = lambda statistic, predictor, error="psnr", given="": told(
-            models.estimate(statistic, predictor, error, given=given)
-        )
-        given = "" if name == COVERAGE else COVERAGE
-        yield {
-            "term": TITLES.get(name, name),
-            "all pixels": find("spearman", name),
-            "kappa = 1": find("spearman", plain) if plain else "",
-            "box minus 1": told(models.difference("psnr", name, plain)) if plain else "",
-            "with coverage": find("spearman", name, COVERAGE) if given else "",
-            "given coverage": find("partial", name, given=given) if given else "",
-            "kappa = 1, given coverage": find("partial", plain, given=given) if plain else "",
-            "seen pixels": find("spearman", name, SEEN_ERROR),
-            "kappa = 1, seen pixels": find("spearman", plain, SEEN_ERROR) if plain else "",
-        }
+def model_figure(scenes: Sequence[SceneModels]) -> Figure:
+    """Returns mean R and mean PSNR of every model: a panel per scene, a color per budget."""
+    figure = style.new_figure(3.6 * len(scenes), 3.2)
+    panels = figure.subplots(1, len(scenes), squeeze=False)[0]
+    budgets = list(dict.fromkeys(m["snapshot"] for models in scenes for m in models.models))
+    for axes, models in zip(panels, scenes, strict=True):
+        style.dress(axes, models.scene, "mean R of the model", "mean PSNR of the model [dB]")
+        x, y = (np.nanmean(models.columns[name], axis=1) for name in ("R", "psnr"))
+        for budget, color in zip(budgets, OKABE_ITO, strict=False):
+            mine = np.array([model["snapshot"] == budget for model in models.models])
+            axes.scatter(x[mine], y[mine], s=22, color=color, alpha=0.75, label=budget)
+    legend_below(figure, budgets)
+    return figure
 
 
 if __name__ == "__main__":

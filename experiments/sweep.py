@@ -1,8 +1,7 @@
-"""Any setting of any config, tried as a grid or at random: by default the curve of lambda1.
+"""Any setting of any config, tried on a grid: by default the curve of lambda1.
 
     python -m experiments.sweep --size smoke
     python -m experiments.sweep --vary lambda1=4,8,16,32 --vary map.voxel_size=0.05,0.1
-    python -m experiments.sweep --vary lambda1=1..256:log --vary radius=0.3..2 --random 20
     python -m experiments.sweep --list
 
 Every point is explored, trained and evaluated in scenes for tuning, which are none of those that
@@ -10,25 +9,19 @@ the committed tables report: nothing is tuned on the test views of a table. The 
 one with the highest mean PSNR over the test views at the end of the budget.
 """
 
+import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from experiments.pages.artifacts import markdown_table
-from experiments.pages.sweep_page import Trial, write_page
-from experiments.settings import known_settings, with_settings
+from experiments.pages.sweep_page import Point, Trial, write_page
+from experiments.settings import Setting, Value, find_setting, known_settings, with_settings
 from experiments.suite import Options as SuiteOptions
 from experiments.suite import origin, request_of, run_cells
-from experiments.sweep_space import (
-    Axis,
-    Point,
-    grid_points,
-    parse_axes,
-    random_points,
-    with_default,
-)
 from r3jax.apps.benchmark.cells import Cell
 from r3jax.apps.benchmark.plan import Request, make_plan
 from r3jax.apps.benchmark.record import read_records
@@ -47,14 +40,8 @@ class Options:
     """`smoke`: minutes. `small`: an hour or two on two cores. `paper`: for GPUs and clusters."""
 
     vary: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """`NAME=A,B,C`, or `NAME=LOW..HIGH[:log]` with --random; may be given several times. By
-    default lambda1, with the values of the size."""
-
-    random: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Try this number of random points instead of all combinations."""
-
-    seed: int = 0
-    """Seed of the random points."""
+    """`NAME=A,B,C`; given several times, all combinations. By default lambda1, with the values of
+    the size."""
 
     policy: str = "r3-pano"
     """The policies."""
@@ -114,7 +101,7 @@ def main(options: Options) -> Path | None:
         print_settings(options)
         return None
     try:
-        axes, points = points_of(options)
+        settings, points = points_of(options)
         request, root = request_for(options), options.work / f"{options.size}-{NAME}"
         root.mkdir(parents=True, exist_ok=True)
         cells = cells_of(make_plan(request, root), points)
@@ -124,8 +111,8 @@ def main(options: Options) -> Path | None:
     trials = [
         Trial(point, last_records(root, own)) for point, own in zip(points, cells, strict=True)
     ]
-    settings = [axis.setting for axis in axes]
-    folder = options.out / NAME / folder_name(options, axes)
+    names = "-".join(setting.short for setting in settings)
+    folder = options.out / NAME / f"{options.size}-{options.policy}-{names}"
     records = [record for trial in trials for record in trial.records]
     write_page(folder, settings, trials, REPORTED, origin(f"experiments.{NAME}", records))
     print(f"results  {folder}")
@@ -158,17 +145,39 @@ def request_for(options: Options) -> Request:
     return replace(request, seeds=options.seeds or size.seeds, conditions=conditions)
 
 
-def points_of(options: Options) -> tuple[tuple[Axis, ...], tuple[Point, ...]]:
-    """Returns what is swept, and the points to try, that of the defaults among them.
+def points_of(options: Options) -> tuple[tuple[Setting, ...], tuple[Point, ...]]:
+    """Returns the swept settings, and the points to try, that of the defaults among them.
 
     Raises:
         ValueError: a setting or a value that does not exist.
     """
     words = options.vary or (f"lambda1={_SIZES[options.size].values}",)
     axes = parse_axes(words, known_settings(request_for(options).conditions))
-    if options.random is None:
-        return axes, with_default(grid_points(axes), axes)
-    return axes, with_default(random_points(axes, options.random, options.seed), axes)
+    names = [setting.name for setting in axes]
+    points = [dict(zip(names, v, strict=True)) for v in itertools.product(*axes.values())]
+    default: Point = {setting.name: setting.default for setting in axes}
+    return tuple(axes), tuple(points if default in points else [default, *points])
+
+
+def parse_axes(
+    words: Sequence[str], known: Mapping[str, Setting]
+) -> dict[Setting, tuple[Value, ...]]:
+    """Returns the values of every swept setting, from `NAME=A,B,C` words.
+
+    Raises:
+        ValueError: a word, a name or a value that is not understood, or something given twice.
+    """
+    axes: dict[Setting, tuple[Value, ...]] = {}
+    for word in words:
+        name, _, text = word.partition("=")
+        if not (name and text):
+            raise ValueError(f"--vary takes NAME=VALUES such as lambda1=4,8,16, got {word!r}")
+        setting = find_setting(name.strip(), known)
+        values = tuple(setting.parse(value.strip()) for value in text.split(","))
+        if setting in axes or len(set(values)) < len(values):
+            raise ValueError(f"{setting.name} or one of its values is given twice: {word!r}")
+        axes[setting] = values
+    return axes
 
 
 def cells_of(plain: tuple[Cell, ...], points: tuple[Point, ...]) -> list[list[Cell]]:
@@ -188,16 +197,9 @@ def in_rounds(cells: list[list[Cell]]) -> list[Cell]:
     return sorted((cell for own in cells for cell in own), key=lambda cell: cell.seed)
 
 
-def last_records(root: Path, cells: list[Cell]) -> list[dict]:
+def last_records(root: Path, cells: list[Cell]) -> list[dict[str, Any]]:
     """Returns the cells' records at the end of the budget."""
     return [r for r in read_records(root, cells) if r["snapshot"] == cells[0].conditions.budget]
-
-
-def folder_name(options: Options, axes: tuple[Axis, ...]) -> str:
-    """Returns the another folder for another sweep."""
-    names = "-".join(axis.setting.short for axis in axes)
-    kind = "" if options.random is None else "-random"
-    return f"{options.size}-{options.policy}-{names}{kind}"
 
 
 if __name__ == "__main__":

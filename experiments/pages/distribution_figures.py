@@ -1,12 +1,11 @@
-"""Figures of single views: how their quality spreads, and what predicts it."""
+"""Figures of single views: how their quality spreads."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.pages.policy_style import OKABE_ITO, legend_below, styles_of
-from experiments.rank_statistics import kendall, spearman
+from experiments.pages.policy_style import styles_of
 from r3jax.apps.benchmark.tables import full_title, metric_named
 from r3jax.evaluation.comparison import (
     Cell,
@@ -17,7 +16,6 @@ from r3jax.evaluation.comparison import (
     with_short_names,
 )
 from r3jax.evaluation.scores import POOR_PSNR
-from r3jax.evaluation.statistics import RESAMPLES, Estimate
 from r3jax.plots import style
 
 _RIDGE_HEIGHT = 1.5
@@ -96,72 +94,3 @@ def ridge_figure(cells: Sequence[Cell], metric: str = "psnr") -> Figure:
         fontsize=8, color=style.MUTED,
     )  # fmt: skip
     return figure
-
-
-def scatter_figure(
-    x: np.ndarray,
-    y: np.ndarray,
-    groups: Sequence[str],
-    *,
-    x_label: str = "renderability R",
-    y_label: str = "PSNR [dB]",
-    title: str = "",
-    resamples: int = RESAMPLES,
-    seed: int = 0,
-) -> Figure:
-    """Returns the score against metric, one point per view, with both distributions at the sides.
-
-    The line above holds Spearman's and Kendall's coefficients of all views with 95 % intervals
-    (resampled within groups).
-
-    Args:
-        x: what predicts, [n]. Views where it or y is NaN are left out.
-        y: the metric, [n].
-        groups: scene, or budget of training, of each view, [n]: its color.
-        x_label: name of x, with its unit.
-        y_label: name of y, with its unit.
-        title: above the coefficients, such as the scene.
-        resamples: of the bootstrap.
-        seed: of the bootstrap.
-
-    Raises:
-        ValueError: different lengths, or fewer than 3 views.
-    """
-    x, y, names = np.asarray(x, float), np.asarray(y, float), np.asarray(groups, str)
-    rank = spearman(x, y, strata=names, seed=seed, resamples=resamples)
-    tau = kendall(x, y, strata=names, seed=seed, resamples=resamples)
-    known = ~np.isnan(x + y)
-    x, y, names = x[known], y[known], names[known]
-    figure = style.new_figure(6.6, 6.2)
-    axes = figure.subplot_mosaic(
-        [["top", "."], ["main", "side"]], width_ratios=[5, 1], height_ratios=[1, 5]
-    )
-    main, top, side = (axes[name] for name in ("main", "top", "side"))
-    style.dress(main, x=x_label, y=y_label)
-    order = list(dict.fromkeys(groups))
-    grids: list[np.ndarray] = [
-        np.linspace(v.min() - 0.05 * np.ptp(v), v.max() + 0.05 * np.ptp(v), 200) for v in (x, y)
-    ]
-    for i, group in enumerate(name for name in order if name in names):
-        mine, color = names == group, OKABE_ITO[i % len(OKABE_ITO)]
-        main.scatter(x[mine], y[mine], s=14, color=color, alpha=0.55, linewidths=0, label=group)
-        shares = [
-            mine.mean() * density(v[mine], grid) for v, grid in zip((x, y), grids, strict=True)
-        ]
-        top.fill_between(grids[0], shares[0], color=color, alpha=0.35, linewidth=0)
-        top.plot(grids[0], shares[0], color=color, linewidth=1.2)
-        side.fill_betweenx(grids[1], shares[1], color=color, alpha=0.35, linewidth=0)
-        side.plot(shares[1], grids[1], color=color, linewidth=1.2)
-    style.blank(top).set_xlim(main.get_xlim())
-    style.blank(side).set_ylim(main.get_ylim())
-    top.set_ylim(bottom=0.0)
-    side.set_xlim(left=0.0)
-    lines = f"Spearman {_told(rank)}, Kendall {_told(tau)}, {rank.count} views"
-    top.set_title(f"{title}\n{lines}" if title else lines, fontsize=10, loc="left")
-    if len(order) > 1:
-        legend_below(figure, order)
-    return figure
-
-
-def _told(found: Estimate) -> str:
-    return f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]"

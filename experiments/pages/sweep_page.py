@@ -22,9 +22,11 @@ from experiments.pages.artifacts import (
 from experiments.pages.benchmark_figures import sweep_figure
 from experiments.settings import Setting, Value
 from experiments.suite import Records
-from experiments.sweep_space import Point
 from r3jax.evaluation.comparison import scenes_of, view_values
 from r3jax.evaluation.statistics import Estimate, Scores, mean_over_scenes, paired_difference
+
+Point = dict[str, Value]
+"""A value for each swept setting, by its whole name."""
 
 
 @dataclass(frozen=True)

@@ -52,21 +52,6 @@ def test_every_flight_is_written_once_under_the_name_of_its_row(tmp_path, flown)
     }
 
 
-def test_poses_of_another_table_are_copied_where_nothing_was_flown(tmp_path, flown):
-    """A flight of here goes before one of there, and a table may be given its own folder."""
-    there, here = (tmp_path / name / "some_flights" for name in ("there", "here"))
-    there.mkdir(parents=True)
-    for seed in (0, 1):
-        (there / f"r3_flat_{seed}.jsonl").write_text(f"flown there, {seed}")
-    cells = {"r3": [a_cell("r3", 0), flown(a_cell("r3", 1)), a_cell("r3", 2)]}
-    for others in (["absent", "there"], ["here"]):
-        kept = [tmp_path / other / "some_records.jsonl" for other in others]
-        flights.keep_flights(tmp_path / "here", "some", tmp_path, cells, kept)
-        assert {path.name for path in here.iterdir()} == {"r3_flat_0.jsonl", "r3_flat_1.jsonl"}
-        assert (here / "r3_flat_0.jsonl").read_text() == "flown there, 0"
-        assert read_submission(here / "r3_flat_1.jsonl").policy["version"] == "r3"
-
-
 def test_the_flights_that_stand_in_the_results_are_read_by_this_version():
     files = sorted((Path(flights.__file__).parent / "results").rglob("*_flights/*.jsonl"))
     assert files

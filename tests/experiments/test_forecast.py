@@ -1,7 +1,5 @@
 """The table of forecast and truth: by hand, and from a table of views that is written here."""
 
-import csv
-
 import numpy as np
 import pytest
 
@@ -30,17 +28,6 @@ def known():
     return known_views()
 
 
-def test_a_row_by_hand(known):
-    pairs = [{"mean": (20.0, 19.0)}, {"mean": (20.0, 22.0)}, {"mean": (20.0, 20.0)}]
-    row = error_row("mean", pairs, ["scene0", "scene1", "scene2"], known)
-    assert row["models"] == 3
-    assert row["rms error [dB]"] == pytest.approx(np.sqrt(5.0 / 3.0))
-    assert row["bias [dB]"] == pytest.approx(-1.0 / 3.0)
-    assert row["bias in scene1"] == -2.0
-    # The others' mean: 21, 19.5, 20.5.
-    assert row["of a constant [dB]"] == pytest.approx(np.sqrt((4.0 + 6.25 + 0.25) / 3.0))
-
-
 def test_an_interval_knows_nothing_of_its_own_scene(known):
     """Half widths come from the errors among the other scenes: a wild one widens not its own."""
     wild = known_views((0.0, 0.0, -8.0))
@@ -60,25 +47,6 @@ def test_the_page_and_the_calibration(known, tmp_path):
     assert all(f"| {name} | 12 |" in page for name in STATISTICS)
     assert "720 views of 12 models in scene0, scene1, scene2" in page
     assert (tmp_path / "forecast.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_the_views_are_those_of_the_table(tmp_path):
-    path = tmp_path / "views.csv"
-    rows = [
-        {"scene": "flat", "method": "r3", "seed": 0, "snapshot": "views:30", "view": view,
-         "coverage": 0.5, "R": 0.25, "psnr": 20 + view}
-        for view in range(3)
-    ]  # fmt: skip
-    with path.open("w") as file:
-        file.write("# command: none\n")
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-    known = read_views(path)
-    np.testing.assert_array_equal(known.psnr, [20.0, 21.0, 22.0])
-    assert known.models == ["flat r3 0 views:30"] * 3
-    with pytest.raises(SystemExit, match="run experiments"):
-        read_views(tmp_path / "missing.csv")
 
 
 def test_the_package_holds_the_small_calibration():

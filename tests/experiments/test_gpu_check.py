@@ -6,11 +6,11 @@ import sys
 import pytest
 
 from experiments import gpu_check
-from experiments.gpu_check import Options, Step, benchmark_rows, main, run, steps_of
+from experiments.gpu_check import Options, Step, benchmark_rows, main, run
 
 
 def test_without_a_gpu_it_says_what_to_install(tmp_path):
-    with pytest.raises(SystemExit, match=r"no GPU.*jax\[cuda12\].*--any-device"):
+    with pytest.raises(SystemExit, match="--any-device"):
         main(Options(out=tmp_path))
     assert not list(tmp_path.iterdir())
 
@@ -23,14 +23,6 @@ def test_a_step_that_fails_is_told_with_its_last_line(tmp_path):
     assert (good["result"], good["last line"]) == ("passed", "3 passed")
     assert (bad["result"], bad["last line"]) == ("failed (4)", "1 failed")
     assert good["seconds"] > 0.0
-
-
-def test_the_steps_are_tests_benchmarks_and_one_small_experiment(tmp_path):
-    steps = steps_of(Options(out=tmp_path, tests=("tests/scoring",)), tmp_path / "timings.json")
-    assert [step.name for step in steps] == ["tests", "benchmarks", "experiment"]
-    assert "tests/scoring" in steps[0].words
-    assert f"--benchmark-json={tmp_path / 'timings.json'}" in steps[1].words
-    assert steps[2].words[-5:-3] == ("smoke", "--work")
 
 
 def test_the_table_holds_every_step_and_every_median(tmp_path, monkeypatch):

@@ -1,6 +1,5 @@
 """What planning costs: a short mission measured for real, and the tables by hand."""
 
-import csv
 import json
 
 import numpy as np
@@ -8,8 +7,7 @@ import pytest
 from PIL import Image
 
 from experiments import planner_latency, planner_memory, planner_runs
-from experiments.pages.artifacts import Origin, markdown_table, write_csv
-from experiments.planner_runs import Options, Size, bucket_of, fly, size_of
+from experiments.planner_runs import Options, Size
 
 pytestmark = pytest.mark.full
 
@@ -42,13 +40,6 @@ def records():
     return [record("a", 0, [1, 2, 3, 4]), record("a", 1, [5, 6, 7, 8]), record("b", 0, [9, 9, 9])]
 
 
-@pytest.mark.parametrize(
-    ("key_frames", "group"), [(1, (1, 6)), (6, (1, 6)), (7, (7, 12)), (301, (301, 306))]
-)
-def test_groups_of_key_frames(key_frames, group):
-    assert bucket_of(key_frames, 6) == group
-
-
 def test_percentiles_by_group(records):
     rows = planner_latency.percentile_rows(records, 2)
     found = [row for row in rows if row["policy"] == "a" and row["part"] == "decide"]
@@ -66,11 +57,6 @@ def test_the_figure_gets_full_groups_only(records):
     np.testing.assert_array_equal(samples["b"][0], [1.5])
 
 
-def test_the_page_tells_the_first_from_the_last_frames(records):
-    text = "\n".join(planner_latency.page(records, 2, "smoke"))
-    assert "| a | 8 | 4.5 | 7.65 | 7.93 | 3.5 | 5.5 |" in text
-
-
 def test_memory_is_the_largest_over_missions(records):
     curves = planner_memory.held_curves(records)
     np.testing.assert_array_equal(curves["a"][0], [1, 2, 3, 4])
@@ -84,37 +70,6 @@ def test_memory_is_the_largest_over_missions(records):
     kind, device = planner_memory.total_curves(records)
     assert kind == "device"
     assert set(device["b"][1]) == {7}
-
-
-def test_the_page_says_what_compiled_programs_take(records):
-    lines = "\n".join(planner_memory.page(records, "smoke")).splitlines()
-    assert next(line for line in lines if line.startswith("| a ")).endswith("| 7 |")
-
-
-def test_what_cannot_be_measured_is_left_empty(records):
-    nothing = [r | {"process_bytes_before": None} for r in records]
-    assert planner_memory.total_curves(nothing) == ("process", {})
-    assert planner_memory.step_rows(nothing)[0]["process_growth_bytes"] is None
-    assert "| – |" in "\n".join(planner_memory.page(nothing, "smoke"))
-
-
-def test_tables_and_their_origin(tmp_path):
-    rows = [{"name": "x", "value": 0.12345}, {"name": "y", "value": None}]
-    table = "| name | value |\n| --- | ---: |\n| x | 0.123 |\n| y | – |"
-    assert markdown_table(rows) == table
-    write_csv(tmp_path / "t.csv", rows, Origin("python -m x", "two cores", "abc"))
-    lines = (tmp_path / "t.csv").read_text().splitlines()
-    assert lines[:3] == ["# command: python -m x", "# machine: two cores", "# commit: abc"]
-    assert next(csv.DictReader(lines[3:])) == {"name": "x", "value": "0.12345"}
-
-
-def test_bytes_of_a_state():
-    assert size_of({"a": np.zeros((3, 4), np.float32), "b": [np.zeros(5, bool)], "c": None}) == 53
-
-
-def test_an_unknown_policy_is_named():
-    with pytest.raises(ValueError, match="unknown best"):
-        Options(policies=("r3", "best"))
 
 
 @pytest.fixture
@@ -165,15 +120,3 @@ def test_a_mission_is_measured_once_and_shown_twice(tiny):
         assert "command: python -m experiments.planner_" in described
         assert "machine: " in described
         assert "commit: " in described
-
-
-def test_another_commit_or_setting_is_flown_anew(tiny, monkeypatch):
-    options, flown = tiny
-    monkeypatch.setattr(planner_runs, "fly", lambda flight: {"flight": vars(flight)})
-    planner_runs.fly_all(options)
-    planner_runs.fly_all(options)
-    assert len(flown) == 1
-    monkeypatch.setattr(planner_runs, "source_commit", lambda: "another")
-    planner_runs.fly_all(options)
-    assert [flight.commit == "another" for flight in flown] == [False, True]
-    assert fly is not planner_runs.fly

@@ -6,14 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from experiments import degeneracy, quality_over_budget, replica_dense
 from experiments.pages.artifacts import Origin
-from experiments.suite import HOUSE, Options, request_of, take_over
+from experiments.suite import HOUSE, Options, take_over
 from r3jax.apps.benchmark.cells import Cell, Conditions, paths_of, snapshots_left
 from r3jax.apps.benchmark.record import read_lines, read_records, write_record, write_records
-from r3jax.planning.registry import policy_names
 from r3jax.runs.writer import RunWriter
 from r3jax.simulators.scenes.registry import open_world
 from tests.evaluation.records import record
@@ -39,27 +37,6 @@ def data_of(path):
     lines = path.read_text().splitlines()
     assert lines[0] == f"# command: {SOURCE.command}"
     return list(csv.DictReader(line for line in lines if not line.startswith("#")))
-
-
-@pytest.mark.parametrize("size", ["smoke", "small", "paper"])
-@pytest.mark.parametrize("unit", ["views", "seconds"])
-def test_every_size_is_a_benchmark_that_can_run(size, unit):
-    request = request_of(Options(size=size), unit)
-    assert set(request.policies) <= set(policy_names())
-    assert {"r3", "r3-pano", "active-gs", "random"} <= set(request.policies)
-    conditions = request.conditions
-    assert conditions.budget == conditions.snapshots[-1]
-    assert conditions.budget.startswith(unit)
-    assert len(conditions.snapshots) >= 2
-    assert conditions.clock == ("wall" if unit == "seconds" else "model")
-    if size == "paper":
-        assert conditions.budget in ("views:300", "seconds:300")
-        assert len(request.seeds) == 3
-    other = request_of(Options(size=size, scenes=("loft",), policies=("cover",)), unit)
-    assert (other.scenes, other.policies) == (("loft",), ("cover",))
-    shorter = request_of(Options(size=size, snapshots=(5, 20)), unit).conditions
-    assert shorter.snapshots == (f"{unit}:5", f"{unit}:20")
-    assert shorter.budget == f"{unit}:20"
 
 
 def test_a_table_of_equal_views_keeps_its_records_and_poses(tmp_path, monkeypatch):
@@ -123,9 +100,7 @@ def test_the_page_of_the_budget_shows_all_its_pictures(records, tmp_path):
     page = (tmp_path / "quality_over_budget.md").read_text()
     for name in (*quality_over_budget.CURVES, "psnr_by_view"):
         assert f"({name}.png)" in page
-        with Image.open(tmp_path / f"{name}.png") as picture:
-            assert SOURCE.commit in picture.info["Description"]
-            assert min(picture.size) > 200
+        assert (tmp_path / f"{name}.png").exists()
     assert {row["method"] for row in data_of(tmp_path / "areas.csv")} == set(POLICIES)
 
 

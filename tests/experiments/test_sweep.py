@@ -1,18 +1,16 @@
 """The sweep: what it chooses, its page, and that what is done is not done again."""
 
-import csv
 import dataclasses
+import re
 
 import numpy as np
 import pytest
-import tyro
-from PIL import Image
 
 from experiments import suite, sweep
 from experiments.pages.artifacts import Origin
-from experiments.pages.sweep_page import Trial, choose, setting_figure, write_page
+from experiments.pages.sweep_page import Trial, choose
 from experiments.settings import known_settings
-from experiments.sweep import Options
+from experiments.sweep import Options, parse_axes
 from r3jax.apps.benchmark.cells import Conditions
 from r3jax.apps.benchmark.engines.local import run_here
 from r3jax.apps.benchmark.plan import Request
@@ -86,87 +84,41 @@ def test_a_gain_that_may_be_chance_is_not_chosen():
 # The page ----------------------------------------------------------------------------------------
 
 
-def page_of(tmp_path, trials, settings=(LAMBDA1,), reported=("flat", "mesh:a/house.glb")):
-    write_page(tmp_path, settings, trials, reported, SOURCE)
-    return (tmp_path / "sweep.md").read_text()
-
-
-def test_the_page_holds_every_point_the_choice_and_its_origin(tmp_path):
-    kappa = KNOWN["policy.kappa"]
-    trials = [
-        Trial({LAMBDA1.name: value, kappa.name: word}, trial(value, (i, -0.2 * i)).records)
-        for i, value in enumerate((1 / 3, 16.0))
-        for word in ("box", "one")
-    ]
-    page = page_of(tmp_path, trials, (LAMBDA1, kappa))
-    assert "| 0.3333 | box |" in page
-    assert "| 16 | one |" in page
-    assert SOURCE.commit in page
-    for name in ("policy_lambda1.png", "policy_kappa.png"):
-        with Image.open(tmp_path / name) as picture:
-            assert SOURCE.commit in picture.info["Description"]
-    lines = [x for x in (tmp_path / "sweep.csv").read_text().splitlines() if x[0] != "#"]
-    rows = list(csv.DictReader(lines))
-    assert [row["lambda1"] for row in rows] == [str(1 / 3)] * 2 + ["16.0"] * 2
-    assert rows[0]["minus default [dB]"].startswith("-0.40 [")
-
-
-def test_the_page_warns_of_scenes_that_tables_report(tmp_path):
-    trials = [trial(16.0, (0.0, 0.0)), trial(4.0, (-1.0, 0.0))]
-    assert "**loft" in page_of(tmp_path, trials, reported=("loft",))
-    assert "**" not in page_of(tmp_path, trials)
-
-
-def test_the_figure_marks_the_default_where_nothing_is_told_apart():
-    noise = np.random.default_rng(0).normal(0.0, 3.0, 12)
-    views = 20.0 + noise - noise.mean()
-    base = [record("r3", "loft", 0, 30, budget=30, psnr=np.full(12, 19.9))]
-    other = [record("r3", "loft", 0, 30, budget=30, psnr=views)]
-    trials = [Trial({LAMBDA1.name: 16.0}, base), Trial({LAMBDA1.name: 8.0}, other)]
-    (axes,) = setting_figure(LAMBDA1, trials, choose(trials, DEFAULT)).axes
-    assert "16" in axes.get_title(loc="right")
-
-
 # The command -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("size", ["smoke", "small", "paper"])
-def test_no_size_tunes_on_scenes_of_the_committed_tables(size):
-    request = sweep.request_for(Options(size=size))
-    assert not set(request.scenes) & set(sweep.REPORTED)
-    assert request.conditions.clock == "model"
-    assert request.conditions.snapshots == (request.conditions.budget,)
-    axes, points = sweep.points_of(Options(size=size))
-    assert len(points) >= 3
-    assert [axis.setting.name for axis in axes] == ["policy.lambda1"]
-    assert len(points) == len(sweep.points_of(Options(size=size, vary=("lambda1=16",)))[1]) + len(
-        [point for point in points if point != DEFAULT]
-    )
-    if size != "smoke":
-        assert len(request.seeds) >= 2
-        assert len(request.scenes) >= 2
+def test_a_grid_holds_every_combination_once_and_the_default_first():
+    settings, points = sweep.points_of(Options(vary=("lambda1=4,8", "policy.kappa=box,one")))
+    assert [setting.name for setting in settings] == ["policy.lambda1", "policy.kappa"]
+    found = [(point["policy.lambda1"], point["policy.kappa"]) for point in points]
+    assert found == [(16.0, "box"), (4.0, "box"), (4.0, "one"), (8.0, "box"), (8.0, "one")]
+    assert len(sweep.points_of(Options(vary=("lambda1=4,16",)))[1]) == 2
+    words = ["allow_growth=true,False", "num_bins=1e2", "sh_every=none,5"]
+    assert list(parse_axes(words, KNOWN).values()) == [(True, False), (100,), (None, 5)]
 
 
-def test_the_words_of_the_command_line():
-    words = ["--vary", "lambda1=4,8", "--vary", "radius=1..2", "--random", "5", "--seeds", "3", "4"]
-    options = tyro.cli(Options, args=words)
-    assert options.vary == ("lambda1=4,8", "radius=1..2")
-    assert (options.random, options.seeds) == (5, (3, 4))
-    assert len(sweep.points_of(options)[1]) == 6  # and the default
-
-
-def test_the_list_has_every_setting(capsys):
-    assert sweep.main(Options(list=True)) is None
-    printed = capsys.readouterr().out
-    for name, setting in KNOWN.items():
-        assert f"| {name} |" in printed
-        assert setting.sentence in printed
-
-
-def test_a_mistake_ends_the_command_with_one_line(tmp_path):
-    with pytest.raises(SystemExit, match=r"sweep: there is no setting 'lamda1': did you mean"):
-        sweep.main(Options(vary=("lamda1=4",), work=tmp_path))
-    assert not list(tmp_path.iterdir())
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["lambda1"], "NAME=VALUES"),
+        (["=4"], "NAME=VALUES"),
+        (["lamda1=4"], "policy.lambda1"),
+        (["policy.voxel_size=4"], "map.voxel_size"),
+        (["xyzzy=4"], "--list"),
+        (["max_range=4"], "sensor.max_range"),
+        (["lambda1=4,many"], "'many'"),
+        (["lambda1=inf"], "'inf'"),
+        (["num_bins=4.5"], "'4.5'"),
+        (["drop_edges=yes"], "'yes'"),
+        (["lambda1=4,4.0"], "policy.lambda1"),
+        (["lambda1=4", "policy.lambda1=8"], "policy.lambda1"),
+    ],
+)
+def test_a_word_that_is_not_understood_is_named(words, named):
+    with pytest.raises(ValueError, match=re.escape(named)):
+        parse_axes(words, KNOWN)
+    with pytest.raises(SystemExit, match=re.escape(named)):
+        sweep.main(Options(vary=tuple(words)))
 
 
 @pytest.mark.full

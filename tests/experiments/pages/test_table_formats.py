@@ -8,7 +8,7 @@ import pytest
 
 from experiments.pages.comparison_tables import difference_table, tail_table
 from experiments.pages.table_formats import to_csv, to_latex, to_markdown
-from r3jax.apps.benchmark.tables import MISSING, Entry, Row, Table, quality_table
+from r3jax.apps.benchmark.tables import quality_table
 from tests.evaluation.records import benchmark
 
 
@@ -94,15 +94,3 @@ def test_csv_keeps_every_digit(tables):
                 assert float(line[column]) == entry.value
                 for name, value in entry.extra.items():
                     assert line[f"{column} {name}"] == str(value)
-
-
-def test_signs_of_the_formats_are_escaped():
-    row = Row(("a|b_c & 5 %", "x"), "1", (Entry(-1.5, "-1.50 [-2.0, +1.0] (room-0)", 1), MISSING))
-    table = Table("50 % & more", ("method", "metric"), ("p_1", "q"), (row,), ("#1 – {note}",))
-    assert read_markdown(to_markdown(table))[2] == [
-        r"a\|b_c & 5 %", "x", "**-1.50 [-2.0, +1.0] (room-0)**", "–",
-    ]  # fmt: skip
-    latex = to_latex(table)
-    assert r"a|b\_c \& 5 \% & x & \textbf{$-$1.50 [$-$2.0, +1.0] (room-0)} & -- \\" in latex
-    assert r"\caption{50 \% \& more}" in latex
-    assert r"\#1 -- \{note\}" in latex

@@ -1,6 +1,6 @@
 """One picture of all nine scenes: views from inside, and each flat cut open from above.
 
-    python -m experiments.scene_gallery docs/images/scenes.png
+    python -m docs.figures.scene_gallery docs/images/scenes.png
 
 Rendering uses the ray-cast simulator, so it takes about half a minute.
 """
@@ -99,7 +99,7 @@ def contact_sheet() -> Image.Image:
 def main() -> None:
     """Writes the contact sheet to the path given on the command line."""
     if len(sys.argv) != 2:
-        raise SystemExit("usage: python -m experiments.scene_gallery OUT.png")
+        raise SystemExit("usage: python -m docs.figures.scene_gallery OUT.png")
     out = Path(sys.argv[1])
     out.parent.mkdir(parents=True, exist_ok=True)
     # 256 colors keep the picture small enough for a README.
