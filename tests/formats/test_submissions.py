@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from r3jax.formats import submissions
 from r3jax.formats.errors import FormatError
 from r3jax.formats.submissions import (
     Submission,
@@ -173,18 +172,3 @@ def test_a_byte_order_mark_and_empty_lines_at_the_end_change_nothing():
     data = changed(1)
     odd = b"\xef\xbb\xbf" + data + b"\r\n\n \n"
     assert_same(parse_submission(odd), parse_submission(data))
-
-
-def test_a_submission_holds_no_more_than_can_be_checked(monkeypatch):
-    monkeypatch.setattr(submissions, "MAX_FRAMES", 3)
-    text = submission_text(make_submission(3)).encode()
-    assert len(parse_submission(text + b"\n\n").frames) == 3
-    with pytest.raises(ForeignFileError, match=r"4 frames, .* 3"):
-        parse_submission(submission_text(make_submission(4)).encode())
-    made = make_submission(3)
-    path = np.linspace(made.frames[0].position, made.frames[1].position, 5, dtype=np.float32)
-    bent = dataclasses.replace(made.frames[1], path=path)
-    text = submission_text(dataclasses.replace(made, frames=(made.frames[0], bent, made.frames[2])))
-    monkeypatch.setattr(submissions, "MAX_WAYPOINTS", 4)
-    with pytest.raises(ForeignFileError, match=r"line 3: .* 5 waypoints, 4"):
-        parse_submission(text.encode())

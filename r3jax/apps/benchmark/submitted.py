@@ -108,10 +108,10 @@ def problems_of(submission: Submission) -> list[Problem]:
 def check_submission(submission: Submission, simulator: Simulator) -> list[Problem]:
     """Lists the rules that a submission breaks, in the order of its lines.
 
-    They are the rules that bound what a camera can do from outside: the scene is the same one, the
-    path begins at its start and stays clear of every surface, the clock leaves time for it, frames
-    captured while moving are no more than the loop takes, and all arrive within the budget. How a
-    policy came to its views is its own affair.
+    They bound what a camera can do: the scene has that hash, the path begins at its start and keeps
+    clear of every surface, the clock leaves time for it, frames captured while moving are no more
+    than the loop takes, and all arrive within the budget. How a policy came to its views is its own
+    affair.
 
     Args:
         submission: as it was read.
@@ -134,51 +134,47 @@ def check_submission(submission: Submission, simulator: Simulator) -> list[Probl
     if not sum(lengths) <= _MAX_LENGTH:
         told = f"its paths are {sum(lengths):.3g} m long, more than {_MAX_LENGTH:g} m"
         return [Problem(None, f"{told}: are the positions in meters? Submit a shorter run")]
-    problems = [*_check_start(submission, simulator), *check_captures(submission, lengths)]
+    told = [(0, text) for text in _check_start(submission, simulator)]
+    told += check_captures(submission, lengths)
     # All paths at once: one by one, ten thousand frames would take a minute.
     rooms = GroundTruth(simulator).room_along(paths, CLEARANCE)
     before, metres, views = submission.frames[0], 0.0, 0
     for frame, path, length, room, place in zip(
         submission.frames, paths, lengths, *rooms, strict=True
     ):
+        flown = metres + length if frame.metres is None else frame.metres
+        texts = [*check_times(submission, before, frame, flown - metres, length)]
         if room < CLEARANCE:
-            what = "runs through a surface" if room == 0.0 else f"comes within {room:.3f} m of one"
-            told = f"its path {what} at {place.round(3).tolist()}: keep {CLEARANCE} m"
-            problems.append(Problem(frame.frame, told))
+            at = place.round(3).tolist()
+            texts.append(f"its path is {room:.3f} m from a surface at {at}: keep {CLEARANCE} m")
         ends = np.stack([before.position, frame.position])
         apart = float(np.linalg.norm(path[[0, -1]] - ends, axis=1).max())
         if apart > _SAME_PLACE:
-            told = f"its path ends {apart:.3f} m from a view: begin at the one before, end at it"
-            problems.append(Problem(frame.frame, told))
-        flown = metres + length if frame.metres is None else frame.metres
-        problems += [
-            Problem(frame.frame, text)
-            for text in check_times(submission, before, frame, flown - metres, length)
-        ]
+            texts.append(f"its path ends {apart:.3f} m from a view: lead from view to view")
         # A frame captured while moving belongs to the view that it was captured before.
         arrival = frame.seconds - frame.mapping
         spent = {"views": views + 1, "frames": frame.frame + 1, "seconds": arrival, "metres": flown}
         if not budget.allows(**spent):  # pyright: ignore[reportArgumentType]
-            told = f"it takes {spent[budget.unit]:g} {budget.unit}, beyond the budget {budget}"
-            problems.append(Problem(frame.frame, format_budget(f"{told}: end before it")))
+            over = f"it takes {spent[budget.unit]:g} {budget.unit}, beyond the budget {budget}"
+            texts.append(format_budget(f"{over}: end before it"))
+        told += [(frame.frame, text) for text in texts]
         before, metres, views = frame, flown, views + (not frame.captured)
-    return sorted(problems, key=lambda problem: problem.frame or 0)
+    return [Problem(number, text) for number, text in sorted(told, key=lambda each: each[0])]
 
 
-def _check_start(submission: Submission, simulator: Simulator) -> Iterator[Problem]:
+def _check_start(submission: Submission, simulator: Simulator) -> Iterator[str]:
     """Yields a problem if the first frame is not taken at the scene's start, at no cost."""
     first, start = submission.frames[0], begin_at(submission.robot, simulator.start_pose)
     apart = float(np.linalg.norm(first.position - start[:3, 3]))
     turned = math.degrees(angle_between(first.pose.astype(np.float64), start))
     if apart > _SAME_PLACE or turned > _SAME_ANGLE:
-        told = f"it lies {apart:.3f} m and {turned:.2f} degrees from the scene's start"
         where = start[:3, 3].round(4).tolist()
-        yield Problem(0, f"{told} with the seed {submission.seed}, {where}: begin there")
+        yield f"it lies {apart:.3f} m and {turned:.2f} degrees from the start {where}: begin there"
     if first.captured or first.metres:
-        yield Problem(0, "the path begins here: leave out `captured`, and `metres`")
+        yield "the path begins here: leave out `captured`, and `metres`"
 
 
-def check_captures(submission: Submission, lengths: Sequence[float]) -> Iterator[Problem]:
+def check_captures(submission: Submission, lengths: Sequence[float]) -> Iterator[tuple[int, str]]:
     """Yields problems of paths with more frames captured while moving than the loop would take.
 
     The loop cuts a path into the fewest equal pieces that are not too long, and captures a frame
@@ -193,15 +189,13 @@ def check_captures(submission: Submission, lengths: Sequence[float]) -> Iterator
         if not is_captured:
             continue
         if not config.captures:
-            told = "`exploration` in line 1 has neither `capture_every` nor `capture_rate`"
-            yield Problem(captured[0], f"it is captured while moving, but {told}")
+            yield captured[0], "is captured without `capture_every` or `capture_rate` in line 1"
             return
         is_whole = after < len(frames)
         length = sum(lengths[captured[0] : after + is_whole])
-        least = num * longest if is_whole else num * longest * num / (num + 1)
+        least = num * longest * (1.0 if is_whole else num / (num + 1))
         if length < _less(least):
-            told = f"{num} frames are captured on {length:.3f} m, they take {least:.3f} m"
-            yield Problem(captured[0], f"{told}: capture fewer")
+            yield captured[0], f"{num} frames are captured on {length:.3f} m, of {least:.3f} m"
 
 
 def check_times(
@@ -214,28 +208,25 @@ def check_times(
     """Yields a problem where the clock leaves too little time to decide, to fly and to map."""
     config, motion = submission.config, submission.robot
     costs = model_clock(config).costs if config.clock == "model" else {}
+    is_first = frame.frame == 0
+    taken = frame.seconds - frame.mapping - (0.0 if is_first else before.seconds)
+    angle = angle_between(before.pose.astype(np.float64), frame.pose.astype(np.float64))
+    turning = 0.0 if motion.turn_rate is None else math.degrees(angle) / motion.turn_rate
+    flight = max(flown, length) / (motion.speed or config.speed)
+    # Between captured frames the camera turns while it flies; to a view it flies first.
+    is_whole = not (frame.captured or before.captured)
+    needed = flight + turning if is_whole else max(flight, turning)
+    if not (is_first or before.captured):  # what follows a captured frame was decided before it
+        needed += costs.get("reconsidering" if config.plan_while_moving else "planning", 0.0)
     if frame.mapping < _less(costs.get("mapping", 0.0)):
         yield f"`mapping` is {frame.mapping:g} s, it takes {costs.get('mapping', 0.0):g} s or more"
     if flown < _less(length):
         yield f"`metres` grows by {flown:.4f}, the path has {length:.4f} m: count all of it"
-    if frame.frame == 0:
-        if frame.seconds < _less(frame.mapping):
-            yield f"`seconds` is {frame.seconds:g}, less than its mapping: the clock begins at 0"
-        return
-    speed, rate = motion.speed or config.speed, motion.turn_rate
-    angle = angle_between(before.pose.astype(np.float64), frame.pose.astype(np.float64))
-    turning = 0.0 if rate is None else math.degrees(angle) / rate
-    flight = max(flown, length) / speed
-    # Between captured frames the camera turns while it flies; to a view it flies first.
-    is_whole = not (frame.captured or before.captured)
-    needed = flight + turning if is_whole else max(flight, turning)
-    if not before.captured:  # what follows a captured frame was decided before it
-        needed += costs.get("reconsidering" if config.plan_while_moving else "planning", 0.0)
-    taken = frame.seconds - frame.mapping - before.seconds
-    if taken < _less(needed):
+    if taken < _less(0.0 if is_first else needed):
+        speed = motion.speed or config.speed
         yield (
-            f"it arrives {taken:.4f} s after the frame before; deciding, {length:.3f} m at "
-            f"{speed:g} m/s and the turn take {needed:.4f} s: count all of them"
+            f"`seconds` leaves {taken:.4f} s for deciding, {length:.3f} m at {speed:g} m/s and the "
+            f"turn, which take {needed:.4f} s: count all of them"
         )
 
 
