@@ -56,6 +56,7 @@ from r3jax.geometry.cameras import Camera, pixel_rays
 from r3jax.geometry.numerics import safe_norm
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.mapping.occupancy import OccupancyGrid, world_to_cell
+from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import Candidates
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.decide import GreedyPolicy
@@ -273,19 +274,35 @@ class Gavis(GreedyPolicy):
     ) -> tuple[Candidates, dict[str, np.ndarray]]:
         """Computes the mean entropy of the rays of every view."""
         del key
-        state, grid, scoring = situation.map_state, situation.scoring_grid, self.config.scoring
+        state, grid = situation.map_state, situation.scoring_grid
         poses = candidates.poses_on_device()
-        ends = score_pixels(
-            ends_of_rays, state, grid, situation.camera, poses, scoring, state.visited
-        )
+        return candidates, {"utility": self.entropies(state, grid, situation.camera, poses)}
+
+    def entropies(
+        self,
+        state: MapState,
+        grid: OccupancyGrid,
+        camera: Camera,
+        poses: Float[Array | np.ndarray, "C 4 4"],
+    ) -> np.ndarray:
+        """Computes the mean entropy of the rays of any views, [C] float64 [nats].
+
+        Args:
+            state: the map.
+            grid: whose unexplored cells count.
+            camera: of the views.
+            poses: of the views.
+        """
+        poses, scoring = jnp.asarray(poses), self.config.scoring
+        ends = score_pixels(ends_of_rays, state, grid, camera, poses, scoring, state.visited)
         utility = entropy_of_views(
             ends,
             grid,
-            pinhole_view(situation.camera, poses[0], scoring).camera,
+            pinhole_view(camera, poses[0], scoring).camera,
             poses,
             scoring.max_range,
             self.config.beliefs(),
             num_bins=state.num_bins,
             num_steps=math.ceil(float(scoring.max_range) / float(grid.cell_size)),
         )
-        return candidates, {"utility": np.asarray(utility, dtype=np.float64)}
+        return np.array(utility, dtype=np.float64)

@@ -5,9 +5,15 @@ frames chosen so far a row has a count, a mean color, a spread and a best resolu
 row and a target that shows it has the nearest seen direction and the sides of kappa's box. All of
 them take another observation in constant time, so that a gain costs what the frame shows.
 
-The value is that of `scoring.terms.score_voxels` on the map of just the frames chosen
-(`renderability_of` computes it that way). `kernels.scoring.frame_gains` has the same in machine
-code, which is held to this.
+The value is that of `scoring.terms.score_voxels` on the map of just the frames chosen, times
+
+    s^(delta b),   s the sharpness (1 / blur in pixels) of the sharpest frame that shows the row
+
+(`renderability_of` computes it that way). R asks for resolution where a view must interpolate,
+with the power 1 - delta b: at the very place of a frame it takes that frame for the truth. A
+blurred one is not; with this factor its blur counts in full from everywhere, until a sharp frame
+shows the same surface. `kernels.scoring.frame_gains` has the same in machine code, which is held
+to this.
 
 Shape symbols: N rows; P pairs; T targets; n frames; m observations.
 """
@@ -47,6 +53,7 @@ class Objective:
         self._lattice = fibonacci_lattice(observed.num_bins).astype(np.float32)
         self._count, self._m2 = np.zeros(num, np.float32), np.zeros(num, np.float32)
         self._mean, self._resolution = np.zeros((num, 3), np.float32), np.zeros(num, np.float32)
+        self._sharpness = np.zeros(num, np.float32)
         self._cosine, self._value = np.zeros(pairs, np.float32), np.zeros(pairs, np.float32)
         self._sides = np.zeros(pairs, np.uint8)
         self._totals = np.zeros(len(targets))
@@ -82,6 +89,7 @@ class Objective:
         after = self._changed(frame)
         self._count[after.row], self._mean[after.row] = after.counts, after.mean
         self._m2[after.row], self._resolution[after.row] = after.m2, after.resolution
+        self._sharpness[after.row] = after.sharpness
         self._cosine[after.pair], self._sides[after.pair] = after.cosine, after.sides
         self._value[after.pair] = after.value
         target = self._targets.target[after.pair]
@@ -93,10 +101,18 @@ class Objective:
 
         seen, to = self._observed, self._targets
         return (
-            kernel.Rows(seen.center, self._count, self._mean, self._m2, self._resolution),
+            kernel.Rows(
+                seen.center, self._count, self._mean, self._m2, self._resolution, self._sharpness
+            ),
             kernel.Pairs(to.first, to.target, to.weight, self._cosine, self._sides, self._value),
             kernel.Observations(
-                seen.first, seen.row, seen.direction, seen.resolution, seen.color, seen.is_colored
+                seen.first,
+                seen.row,
+                seen.direction,
+                seen.resolution,
+                seen.color,
+                seen.is_colored,
+                seen.sharpness,
             ),
             kernel.Targets(to.position, to.focal),
         )
@@ -113,6 +129,7 @@ class Objective:
         mean = self._mean[rows] + gap / safe[:, None]
         m2 = self._m2[rows] + (gap**2).sum(axis=1) * before / safe
         best = np.maximum(self._resolution[rows], seen.resolution[part])
+        sharp = np.maximum(self._sharpness[rows], seen.sharpness[frame])
         length = to.first[rows + 1] - to.first[rows]
         at = np.repeat(np.arange(len(rows)), length)
         pair = np.arange(length.sum()) + np.repeat(
@@ -126,11 +143,11 @@ class Objective:
         cosine = np.clip(np.maximum(cosine, self._cosine[pair]), 0.0, 1.0)
         value = _value(
             cosine, sides == _ALL_SIDES, _consistency(count, m2)[at],
-            np.minimum(best[at] * distance / to.focal[to.target[pair]], 1.0),
+            np.minimum(best[at] * distance / to.focal[to.target[pair]], 1.0), sharp[at],
         )  # fmt: skip
         value = np.where(count[at] > 0.0, value, self._value[pair])
         gain = to.weight[pair] * (value - self._value[pair]).astype(np.float64)
-        return _Changed(rows, count, mean, m2, best, pair, cosine, sides, value, gain)
+        return _Changed(rows, count, mean, m2, best, sharp, pair, cosine, sides, value, gain)
 
 
 class _Changed(NamedTuple):
@@ -141,6 +158,7 @@ class _Changed(NamedTuple):
     mean: np.ndarray
     m2: np.ndarray
     resolution: np.ndarray
+    sharpness: np.ndarray
     pair: np.ndarray
     cosine: np.ndarray
     sides: np.ndarray
@@ -164,12 +182,17 @@ def _consistency(count: np.ndarray, m2: np.ndarray) -> np.ndarray:
 
 
 def _value(
-    cosine: np.ndarray, is_inside: np.ndarray, delta: np.ndarray, ratio: np.ndarray
+    cosine: np.ndarray,
+    is_inside: np.ndarray,
+    delta: np.ndarray,
+    ratio: np.ndarray,
+    sharpness: np.ndarray,
 ) -> np.ndarray:
-    """Computes R of pairs (`scoring.terms`)."""
+    """Computes R of pairs (`scoring.terms`), and what blur leaves of it."""
     kappa = np.where(is_inside, 1.0, 2.0)
     bias = cosine**kappa
-    return bias * delta ** (kappa * (1.0 - bias)) * ratio ** (1.0 - delta * bias)
+    near = delta * bias
+    return bias * delta ** (kappa * (1.0 - bias)) * ratio ** (1.0 - near) * sharpness**near
 
 
 def renderability_of(observed: Observed, targets: Targets, frames: Sequence[int]) -> np.ndarray:
@@ -178,16 +201,28 @@ def renderability_of(observed: Observed, targets: Targets, frames: Sequence[int]
     By the formulas of the package, from nothing: what `Objective` brings up to date.
     """
     state = observed.map_of(frames)
+    sharp = np.zeros(observed.num_rows, np.float32)
+    for frame in frames:
+        shown = observed.row[observed.first[frame] : observed.first[frame + 1]]
+        sharp[shown] = np.maximum(sharp[shown], observed.sharpness[frame])
     row = np.repeat(np.arange(observed.num_rows), np.diff(targets.first))
-    value = np.asarray(_values(state, jnp.asarray(targets.position), jnp.asarray(targets.focal)))
+    views = jnp.asarray(targets.position), jnp.asarray(targets.focal)
+    value = np.asarray(_values(state, jnp.asarray(sharp), *views))
     shares = targets.weight.astype(np.float64) * value[targets.target, row]
     return np.bincount(targets.target, shares, len(targets))
 
 
 @jax.jit
 def _values(
-    state: MapState, position: Float[Array, "T 3"], focal: Float[Array, " T"]
+    state: MapState,
+    sharpness: Float[Array, " N"],
+    position: Float[Array, "T 3"],
+    focal: Float[Array, " T"],
 ) -> Float[Array, "T N"]:
-    """Computes R of every row from every target."""
-    score = lambda position, focal: score_voxels(state, position, focal).value
-    return jax.lax.map(lambda pair: score(*pair), (position, focal))
+    """Computes R of every row from every target, and what blur leaves of it."""
+
+    def value(view: tuple[Array, Array]) -> Float[Array, " N"]:
+        found = score_voxels(state, *view)
+        return found.value * sharpness ** (found.delta * found.bias)
+
+    return jax.lax.map(value, (position, focal))

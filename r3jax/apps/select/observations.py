@@ -56,6 +56,9 @@ class Observed:
     is_colored: np.ndarray
     """False where no pixel fell into the voxel, which was seen anyway, [m]."""
 
+    sharpness: np.ndarray
+    """Of each frame, in (0, 1]: 1 over the width of its blur [px], [n] float32."""
+
     def __len__(self) -> int:
         """Returns the number of frames."""
         return len(self.first) - 1
@@ -155,7 +158,8 @@ def observe(
     columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
     first = np.cumsum([0, *(len(part[0]) for part in parts)])
     size = float(whole.voxel_size)
-    return Observed(key[:, occupied], size, whole.num_bins, first, *columns)
+    sharp = np.ones(count, np.float32)
+    return Observed(key[:, occupied], size, whole.num_bins, first, *columns, sharp)
 
 
 def ordered_rows(whole: MapState) -> np.ndarray:

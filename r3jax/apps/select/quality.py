@@ -1,7 +1,8 @@
 """How good the pictures are, in the terms of the formulas.
 
 Blur. Detail that a frame shows, as a share of that of its neighbors (`captures.faults`), becomes
-the width of a blur, and the resolution of what the frame observes is divided by it. A blur of b
+the width of a blur, and the resolution of what the frame observes is divided by it; so is what a
+view sees that need not interpolate (`objective`). A blur of b
 pixels in all directions leaves about 1 / b^2 of the squared second differences: of pictures of two
 recordings that were blurred on purpose 0.27 and 0.48 (b = 2), 0.10 and 0.21 (3), 0.04 and 0.10 (4).
 Where all frames are blurred alike, nothing tells.
@@ -95,6 +96,7 @@ def with_quality(observed: Observed, blur: np.ndarray, exposure: np.ndarray) -> 
     return dataclasses.replace(
         observed,
         resolution=(observed.resolution / blur[frame]).astype(np.float32),
+        sharpness=(observed.sharpness / blur).astype(np.float32),
         color=(observed.color / exposure[frame]).astype(np.float32),
     )
 

@@ -27,6 +27,7 @@ from r3jax.captures.capture_maps import join_frame, join_on_rows, map_grid
 from r3jax.captures.faults.blocks import BlockImage, block_image
 from r3jax.captures.source import Picture, Source, thinned
 from r3jax.captures.standpoints import places_of
+from r3jax.captures.surfaces import with_surfaces
 from r3jax.captures.survey import RANGE, Survey, survey_of
 from r3jax.errors import InputError
 from r3jax.formats.errors import FormatError
@@ -110,10 +111,12 @@ def select(
             camera path outside of the capture; nothing would be kept.
         FormatError: fewer than two frames can be read, or nothing is said of depth.
         RunError: a file of a run is missing or broken.
+        SceneFileError: the trained splat cannot be read.
     """
     settings = SelectSettings() if settings is None else settings
     if settings.depth_scale != 1.0 or settings.depth_along_ray:
         source = source.with_depth(settings.depth_scale, is_along_ray=settings.depth_along_ray)
+    source = with_surfaces(source, settings.surfaces, settings.model, on_progress)
     step = lambda: on_progress("", 1)
     on_progress("looking at the capture", 0)
     survey = survey_of(source, settings)

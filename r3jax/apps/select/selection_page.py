@@ -36,6 +36,10 @@ _GROUPS = (("blurred", "Blurred"), ("twin", "Twins of a frame that is kept"),
 
 _SURFACES = {
     "depth": "Surfaces are those of the depth images.",
+    "stereo": "Surfaces are those of COLMAP's stereo depth maps; what they leave out is not known.",
+    "sweep": "There are no depth images: depth was computed by comparing the photos with each "
+    "other (plane sweep); where they do not agree, nothing is known.",
+    "model": "Surfaces are those of the trained splat; what two images contradict is not known.",
     "tracks": "There are no depth images: surfaces are the points of the structure from motion, "
     "each as seen in its own pictures. What has no points counts as not shown.",
     "cloud": "There are no depth images: surfaces are a cloud of points, of which nearer ones hide "

@@ -18,9 +18,10 @@ import numpy as np
 from numba import prange
 
 from r3jax.kernels.constants import ON_EDGE
+from r3jax.kernels.native.arithmetic import exp2, log2
 from r3jax.kernels.native.compiled import called_from_python, inlined_fused
 from r3jax.kernels.native.ffi import num_workers, require_threads
-from r3jax.kernels.scoring.terms import consistency, log2_or_never, product_of_terms
+from r3jax.kernels.scoring.terms import bias_of, consistency, log2_or_never, product_of_terms
 
 _ZERO, _ONE, _LEAST = np.float32(0.0), np.float32(1.0), np.float32(1e-6)
 _POLE, _EDGE = np.float32(1e-12), np.float32(ON_EDGE)
@@ -44,6 +45,9 @@ class Rows(NamedTuple):
 
     resolution: Any
     """Best [px/m], [N] float32."""
+
+    sharpness: Any
+    """Of the sharpest frame, in (0, 1]; 0 before any, [N] float32."""
 
 
 class Pairs(NamedTuple):
@@ -89,6 +93,9 @@ class Observations(NamedTuple):
     is_colored: Any
     """False where no pixel fell into the voxel, which was seen anyway, [m]."""
 
+    sharpness: Any
+    """Of each frame, in (0, 1], [n] float32."""
+
 
 class Targets(NamedTuple):
     """Views whose renderability counts."""
@@ -114,7 +121,7 @@ def _color_after(rows, row, color, at):
 
 
 @inlined_fused
-def _pair_after(rows, pairs, targets, row, pair, q, delta, log_delta, best):
+def _pair_after(rows, pairs, targets, row, pair, q, delta, log_delta, best, log_sharp):
     """Returns cosine, sides and renderability of a pair after another direction q was seen."""
     target = pairs.target[pair]
     x = targets.position[target, 0] - rows.center[row, 0]
@@ -137,6 +144,8 @@ def _pair_after(rows, pairs, targets, row, pair, q, delta, log_delta, best):
     value = product_of_terms(
         cosine, is_inside, distance, delta, log_delta, best, targets.focal[target]
     )
+    if log_sharp < _ZERO:
+        value *= exp2(delta * bias_of(cosine, is_inside) * log_sharp)
     return cosine, sides, value
 
 
@@ -169,10 +178,11 @@ def _gains(rows, pairs, observations, targets, candidates, lattice, workers, out
                 if count == _ZERO:
                     continue
                 log_delta, k = log2_or_never(delta), observations.direction[at]
+                log_sharp = log2(max(rows.sharpness[row], observations.sharpness[frame]))
                 q = lattice[k, 0], lattice[k, 1], lattice[k, 2]
                 for pair in range(begin, end):
                     _, _, value = _pair_after(
-                        rows, pairs, targets, row, pair, q, delta, log_delta, best
+                        rows, pairs, targets, row, pair, q, delta, log_delta, best, log_sharp
                     )
                     total += pairs.weight[pair] * (value - pairs.value[pair])
             out[c] = total
@@ -186,10 +196,12 @@ def _add(rows, pairs, observations, targets, frame, lattice, totals):
         rows.count[row], rows.m2[row], rows.resolution[row] = count, spread, best
         rows.mean[row, 0], rows.mean[row, 1], rows.mean[row, 2] = m0, m1, m2
         log_delta, k = log2_or_never(delta), observations.direction[at]
+        rows.sharpness[row] = max(rows.sharpness[row], observations.sharpness[frame])
+        log_sharp = log2(rows.sharpness[row])
         q = lattice[k, 0], lattice[k, 1], lattice[k, 2]
         for pair in range(pairs.first[row], pairs.first[row + 1]):
             cosine, sides, value = _pair_after(
-                rows, pairs, targets, row, pair, q, delta, log_delta, best
+                rows, pairs, targets, row, pair, q, delta, log_delta, best, log_sharp
             )
             pairs.cosine[pair], pairs.sides[pair] = cosine, sides
             if count > _ZERO:

@@ -30,6 +30,7 @@ def observed_of(seed: int, frames: int = 9, rows: int = 40, scenes: int = 1) -> 
         resolution=rng.uniform(50.0, 400.0, size).astype(np.float32),
         color=rng.normal(0.5, 0.1, (size, 3)).clip(0, 1).astype(np.float32),
         is_colored=rng.random(size) < 0.8,
+        sharpness=rng.choice([1.0, 0.6, 0.3], frames).astype(np.float32),
     )
 
 
@@ -57,4 +58,7 @@ def shuffled(observed: Observed, order: np.ndarray) -> Observed:
         for name in ("row", "direction", "resolution", "color", "is_colored")
     }
     first = np.cumsum([0, *np.diff(observed.first)[order]])
-    return Observed(key=observed.key, voxel_size=0.1, num_bins=64, first=first, **columns)
+    return Observed(
+        key=observed.key, voxel_size=0.1, num_bins=64, first=first,
+        sharpness=observed.sharpness[order], **columns,
+    )  # fmt: skip

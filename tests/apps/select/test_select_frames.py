@@ -50,6 +50,14 @@ def test_of_two_frames_from_one_place_the_sharp_one_is_chosen(frames):
     assert r3jax.select_frames(twins, 1, blur=blur, voxel_size=0.15).order[0] == len(frames)
 
 
+def test_blur_counts_from_the_very_place_of_a_frame(frames):
+    own = np.asarray(frames[0].T_world_camera)[None]
+    seen = lambda blur: r3jax.select_frames(
+        frames[:1], 1, targets=own, blur=[blur], voxel_size=0.15
+    ).objective[-1]  # fmt: skip
+    assert seen(4.0) == pytest.approx(seen(1.0) / 4.0, rel=0.02)
+
+
 @pytest.mark.parametrize(("settings", "named"), [
     ({"num": 0}, "frames"),
     ({"num": 2, "share": 0.5}, "share"),
