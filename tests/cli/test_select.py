@@ -1,13 +1,17 @@
 """`r3jax select`, as a user meets it: reduced captures that other programs read."""
 
 import json
+import os
+import signal
 
 import numpy as np
 import pytest
 from PIL import Image
+from scipy import ndimage
 
 from r3jax.captures import capture_maps
 from r3jax.captures.camera_paths import write_camera_path
+from r3jax.cli.console import Stages
 from r3jax.cli.main import main
 from r3jax.formats.captures import open_capture
 from r3jax.formats.colmap.reader import find_model, read_model
@@ -20,6 +24,7 @@ from tests.apps.audit.room import (
     write_nerfstudio,
     write_recording,
 )
+from tests.captures.faults.walk import CAMERA, walk
 from tests.conftest import shared_path
 from tests.formats.phones import video
 
@@ -132,6 +137,45 @@ def test_a_recording_becomes_a_transforms_json_with_depth(captures, tmp_path):
         np.testing.assert_allclose(new.depth(i), old.depth(at), atol=1e-3)
 
 
+def check_by_nerfstudios_rules(folder):
+    """What its parser asserts (nerfstudio_dataparser.py), in our words."""
+    content = json.loads((folder / "transforms.json").read_text())
+    frames = content["frames"]
+    names = [frame["file_path"] for frame in frames]
+    assert all((folder / name).is_file() for name in names)
+    for field in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
+        assert field in content or all(field in frame for frame in frames)
+    for field in ("depth_file_path", "mask_path"):
+        given = [frame[field] for frame in frames if field in frame]
+        assert len(given) in (0, len(frames))
+        assert all((folder / name).is_file() for name in given)
+    assert content.get("camera_model", "OPENCV") in ("OPENCV", "OPENCV_FISHEYE", "PINHOLE")
+    splits = [content.get(f"{split}_filenames") for split in ("train", "val", "test")]
+    assert splits == [None] * 3 or all(part and set(part) <= set(names) for part in splits)
+    if "ply_file_path" in content:
+        assert (folder / content["ply_file_path"]).is_file()
+
+
+@pytest.mark.parametrize("train", [4, 14])
+def test_nerfstudio_would_open_what_is_written(captures, tmp_path, train):
+    assert select(captures / "recording", tmp_path / "made", "--frames", "5") == 0
+    check_by_nerfstudios_rules(tmp_path / "made")
+    capture = tmp_path / "with_splits"
+    write_nerfstudio(capture, round_poses(), depth=True)
+    content = json.loads((capture / "transforms.json").read_text())
+    names = [frame["file_path"] for frame in content["frames"]]
+    content |= {"cx": LENS.width / 2, "cy": LENS.height / 2}
+    content |= {"train_filenames": names[:train], "val_filenames": names[train:15],
+                "test_filenames": names[15:]}  # fmt: skip
+    (capture / "transforms.json").write_text(json.dumps(content))
+    words = ("--frames", "5", "--keep", "000.png", "014.png", "015.png")
+    assert select(capture, tmp_path / "kept", *words) == 0
+    check_by_nerfstudios_rules(tmp_path / "kept")
+    assert "test_filenames" in json.loads((tmp_path / "kept" / "transforms.json").read_text())
+    assert select(capture, tmp_path / "lost", "--frames", "1") == 0
+    check_by_nerfstudios_rules(tmp_path / "lost")
+
+
 def test_the_same_folder_is_written_again_but_nothing_that_is_not_ours(captures, tmp_path):
     out = tmp_path / "out"
     for count in (8, 3):
@@ -181,6 +225,82 @@ def test_targets_may_be_a_path_but_not_outside_of_the_capture(captures, tmp_path
     words = ("--frames", "3", "--targets", str(tmp_path / "out.json"))
     assert select(captures / "recording", tmp_path / "out", *words) == 2
     assert "out.json" in capsys.readouterr().err
+
+
+def test_targets_may_be_where_people_could_stand(captures, tmp_path):
+    words = ("--frames", "4", "--targets", "stand")
+    assert select(captures / "recording", tmp_path / "out", *words) == 0
+    record = record_of(tmp_path / "out")
+    assert record["targets"] == "stand"
+    assert record["num_targets"] % 8 == 0  # level directions of each place
+    assert len(record["kept"]) == 4
+    assert np.all(np.diff(record["objective"]) >= -1e-6)
+
+
+def test_ctrl_c_writes_the_frames_chosen_so_far(captures, tmp_path, monkeypatch):
+    told, stages = Stages.on_progress, []
+
+    def on_progress(self, stage, steps):
+        told(self, stage, steps)
+        stages.append(stage)
+        if stages[-2:] == ["choosing frames", ""]:  # after the first choice
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(Stages, "on_progress", on_progress)
+    assert select(captures / "nerfstudio", tmp_path / "out", "--frames", "6") == 0
+    record = record_of(tmp_path / "out")
+    assert 1 <= len(record["kept"]) < 6
+    assert not record["is_complete"]
+    assert len(open_capture(tmp_path / "out").source) == len(record["kept"])
+
+
+def write_walk(folder, smeared, width=9):
+    """A walk through a flat; some of its frames are smeared, across and down."""
+    for name in ("images", "depth"):
+        (folder / name).mkdir(parents=True)
+    for i, (rgb, depth, _) in enumerate(walk()):
+        size = (width, width, 1) if i in smeared else 1
+        Image.fromarray(ndimage.uniform_filter(rgb, size)).save(folder / "images" / f"{i:03d}.png")
+        steps = np.rint(1000.0 * depth).astype(np.uint16)
+        Image.fromarray(steps).save(folder / "depth" / f"{i:03d}.png")
+    fx, fy, cx, cy = (float(v) for v in (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy))
+    np.savetxt(folder / "K.txt", [[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
+    poses = np.stack([pose for _, _, pose in walk()])
+    np.savetxt(folder / "poses.txt", poses.reshape(-1, 16), fmt="%.9g")
+
+
+def test_blurred_frames_alone_are_left_out(tmp_path):
+    write_walk(tmp_path / "walk", {4, 9})
+    assert select(tmp_path / "walk", tmp_path / "out", "--drop-blurred") == 0
+    dropped = record_of(tmp_path / "out")["dropped"]
+    assert set(dropped) == {"004.png", "009.png"}
+    assert all("blurred" in why for why in dropped.values())
+    words = ("--drop-blurred", "--keep", "004.png")
+    assert select(tmp_path / "walk", tmp_path / "kept", *words) == 0
+    assert set(record_of(tmp_path / "kept")["dropped"]) == {"009.png"}
+
+
+def test_a_blurred_frame_is_no_choice_where_sharp_ones_show_the_same(tmp_path):
+    write_walk(tmp_path / "walk", {4, 9})
+    assert select(tmp_path / "walk", tmp_path / "out", "--frames", "6") == 0
+    assert not {"004.png", "009.png"} & set(record_of(tmp_path / "out")["kept"])
+
+
+def test_that_all_are_blurred_is_said(tmp_path):
+    write_walk(tmp_path / "walk", set(range(len(walk()))), 5)
+    assert select(tmp_path / "walk", tmp_path / "out", "--frames", "3", "--drop-blurred") == 0
+    assert any("blurred" in note for note in record_of(tmp_path / "out")["notes"])
+
+
+def test_surfaces_of_photos_alone_may_be_points_or_swept(captures, tmp_path):
+    words = ("--frames", "4", "--surfaces", "points")
+    assert select(captures / "colmap", tmp_path / "points", *words) == 0
+    assert record_of(tmp_path / "points")["surfaces_from"] == "tracks"
+    capture = shared_path("recordings", "lounge_sfm")
+    words = ["--frames", "5", "--out", str(tmp_path / "swept")]
+    assert main(["select", str(capture / "sparse" / "3"), *words]) == 0
+    assert record_of(tmp_path / "swept")["surfaces_from"] == "sweep"
+    assert "plane sweep" in (tmp_path / "swept" / "selection.html").read_text()
 
 
 def test_two_scenes_are_kept_in_proportion_and_it_is_said(captures, tmp_path):

@@ -164,6 +164,9 @@ def _reduce_transforms(
     for other in sorted(path.parent.glob("transforms_*.json")):
         if other != path:  # views that NeRF's data sets hold out for tests
             _take_split(other, files)
+    if not all(splits.values()):  # nerfstudio refuses a list without frames, and missing ones
+        content = {key: value for key, value in content.items() if key not in _SPLITS}
+        splits = {}
     reduced = {**content, **splits, "frames": frames}
     files.write(path.name, (json.dumps(reduced, indent=1) + "\n").encode())
     return files.folder / path.name
@@ -258,19 +261,25 @@ def _write_transforms(
 ) -> Path:
     """Writes a transforms.json of a capture that comes without one."""
     frames: list[dict[str, Any]] = []
+    # nerfstudio takes depth of all frames or of none.
+    has_depth = isinstance(source, Run) or any(path is not None for path in source.depth_paths)
     for index in kept.tolist():
         lens, pose = found.source.lenses[index], found.source.poses[index]
         name = _image_name(source, index)
         frame = {"file_path": f"images/{name}", **_lens_fields(lens)}
         _take_image(source, index, frame["file_path"], files)
-        depth = _depth(source, index)
-        if depth is not None:
+        if has_depth:
+            depth = _depth(source, index)
+            depth = np.zeros((lens.height, lens.width)) if depth is None else depth
             frame["depth_file_path"] = f"depth/{Path(name).stem}.png"
             files.write(frame["depth_file_path"], _depth_png(depth))
         frame["transform_matrix"] = (pose @ OPENGL_FROM_OPENCV).tolist()
         frames.append(frame)
         on_frame()
     content: dict[str, Any] = {"depth_unit_scale_factor": 0.001, "frames": frames}
+    # nerfstudio looks for the model of the cameras beside the frames, not in them.
+    if len(models := {frame["camera_model"] for frame in frames}) == 1:
+        content["camera_model"] = models.pop()
     points, colors = voxel_points(found.whole)
     if found.source.has_images:
         back = found.survey.alignment.points_back(points).astype(np.float32)

@@ -16,6 +16,7 @@ from r3jax.apps.select.observations import Observed, map_frames, observe
 from r3jax.apps.select.quality import (
     Quality,
     exposures,
+    fineness,
     quality_of,
     unknown_quality,
     with_quality,
@@ -121,7 +122,7 @@ def select(
     on_progress("looking at the capture", 0)
     survey = survey_of(source, settings)
     on_progress("reading frames", len(survey.chosen))
-    whole, images, unread = _surfaces(source, survey, step)
+    whole, images, fine, unread = _surfaces(source, survey, step)
     used = np.setdiff1d(survey.chosen, list(unread))
     if len(used) < 2:
         raise next(iter(unread.values()), FormatError(Path(source.name), "fewer than two frames"))
@@ -136,7 +137,7 @@ def select(
             "nothing to choose between: are the poses right?"
         )
     on_progress("comparing frames", 0)
-    quality = quality_of(images, observed) if source.has_images else unknown_quality(observed)
+    quality = quality_of(images, fine, observed) if source.has_images else unknown_quality(observed)
     observed = with_quality(observed, quality.blur, quality.exposure)
     keep = _named(source, used, settings.keep)
     allowed, reasons = _allowed(settings, quality, source, used, keep)
@@ -170,9 +171,10 @@ def select(
 
 def _surfaces(
     source: Source, survey: Survey, on_frame: Callable[[], None]
-) -> tuple[MapState, list[BlockImage], dict[int, FormatError]]:
-    """Maps all frames; returns also their pictures in blocks, and unreadable frames."""
+) -> tuple[MapState, list[BlockImage], list[float], dict[int, FormatError]]:
+    """Maps all frames; returns also their pictures in blocks, their fineness, and unread frames."""
     images: list[BlockImage] = []
+    fine: list[float] = []
     unread: dict[int, FormatError] = {}
 
     def frames() -> Iterator[Frame]:
@@ -183,11 +185,12 @@ def _surfaces(
                 unread[index] = error
             else:
                 images.append(block_image(*picture, source.camera(index), source.poses[index]))
+                fine.append(fineness(picture[0]))
                 yield source.framed(picture, index, survey.alignment)
             on_frame()
 
     whole = map_frames(frames(), survey.voxel_size, drop_edges=source.is_dense)
-    return whole, images, unread
+    return whole, images, fine, unread
 
 
 def _named(source: Source, used: np.ndarray, names: Sequence[str]) -> list[int]:
@@ -338,6 +341,11 @@ def _notes(found: Selected, targets: Targets, num_unread: int) -> tuple[str, ...
         notes.append(
             f"The capture holds {len(large)} scenes that share no surface: frames of each are kept "
             f"in proportion ({parts})."
+        )
+    if found.quality.is_soft:
+        notes.append(
+            "All frames are blurred, or enlarged: hardly any of them has detail of the size of a "
+            "pixel. What is chosen is the best of them; only another capture would be sharper."
         )
     blurred = found.quality.is_blurred
     if blurred[found.choice.order].any():
