@@ -106,7 +106,7 @@ def write_walk(options: Options) -> None:
     for i in range(count):
         shutter = np.linspace(-0.5, 0.5, 1 if judges[i] else _SUBFRAMES)
         looks = directions(turns[i] + shutter[:, None] * while_open[i])
-        seen = [world.render(pose_along(position[i], look)) for look in looks]
+        seen = [world.render(np.asarray(pose_along(position[i], look))) for look in looks]
         middle = seen[len(seen) // 2]
         rgb = exposure[i] * np.mean([np.asarray(frame.rgb) for frame in seen], axis=0)
         rgb = np.clip(rgb + _NOISE * rng.normal(0.0, 1.0, rgb.shape), 0.0, 1.0)

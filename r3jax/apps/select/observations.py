@@ -155,11 +155,16 @@ def observe(
     for number in range(count):
         parts.append(_part(join(nothing, whole, read(number)), row_of))
         on_frame()
-    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    row, direction, resolution, color, is_colored = (
+        np.concatenate(column) for column in zip(*parts, strict=True)
+    )
     first = np.cumsum([0, *(len(part[0]) for part in parts)])
     size = float(whole.voxel_size)
     sharp = np.ones(count, np.float32)
-    return Observed(key[:, occupied], size, whole.num_bins, first, *columns, sharp)
+    return Observed(
+        key[:, occupied], size, whole.num_bins, first, row, direction, resolution, color,
+        is_colored, sharp,
+    )  # fmt: skip
 
 
 def ordered_rows(whole: MapState) -> np.ndarray:
