@@ -31,7 +31,7 @@ from PIL import Image
 from experiments.pages.artifacts import joint_origin, markdown_table, write_markdown
 from experiments.photo_rivals import by_fisher, by_gavis
 from r3jax.apps.benchmark.record import machine, source_commit
-from r3jax.apps.select.select import select
+from r3jax.apps.select.select import Selected, select
 from r3jax.apps.select.settings import SelectSettings
 from r3jax.captures.alignment import evenly_spaced
 from r3jax.captures.source import Source, source_of
@@ -63,7 +63,7 @@ class Options:
     captures: tuple[Path, ...]
     """What `r3jax select` reads."""
 
-    shares: tuple[float, ...] = (0.1, 0.2, 0.05, 0.4)
+    shares: tuple[float, ...] = (0.2, 0.1, 0.05, 0.4)
     """Of the frames on offer, in the order in which they are run: two by two."""
 
     choosers: tuple[str, ...] = (
@@ -141,7 +141,15 @@ def part(source: Source, numbers: np.ndarray) -> Source:
 def _select(pool: Pool, num: int, seed: int, options: Options) -> np.ndarray:
     """As `r3jax select --frames`, of the frames on offer."""
     del seed, options
-    return select(part(pool.source, pool.offered), SelectSettings(frames=num)).kept
+    found = _SELECTED.get(pool.name)
+    if found is None or found.scenes.max() > 0 or len(found.choice.order) < num:
+        found = select(part(pool.source, pool.offered), SelectSettings(frames=num))
+        _SELECTED[pool.name] = found
+    return found.used[found.choice.order[:num]]
+
+
+_SELECTED: dict[str, Selected] = {}
+"""The latest selection of each capture: fewer frames of one scene are the first of more."""
 
 
 def _uniform(pool: Pool, num: int, seed: int, options: Options) -> np.ndarray:
@@ -345,7 +353,8 @@ def table(records: Sequence[Record], share: float) -> list[dict[str, Any]]:
         rows.append((psnr.value, {
             "chooser": chooser,
             "PSNR [dB]": _text(psnr),
-            "select minus it": "" if chooser == "select" else _lead(at, chooser),
+            "minus all frames": lead(at, chooser, "all"),
+            "select minus it": lead(at, "select", chooser),
             "10th percentile": f"{mean(_worst_tenth):.2f}",
             "SSIM": f"{mean(lambda record: np.mean(record['ssim'])):.3f}",
             "LPIPS": f"{mean(lambda record: np.mean(record['lpips'])):.3f}"
@@ -374,15 +383,21 @@ def _scores(records: Sequence[Record], metric: str) -> dict[str, np.ndarray]:
     return {c: np.array([r[metric] for r in ordered if r["capture"] == c]) for c in captures}
 
 
-def _lead(records: Sequence[Record], chooser: str) -> str:
-    """The gain of `select` in PSNR on the same frames, captures and seeds [dB]."""
+def difference(records: Sequence[Record], first: str, second: str) -> Estimate | None:
+    """PSNR of one chooser minus another's on the same frames, captures and seeds [dB]."""
     runs = lambda name: {(r["capture"], r["seed"]): r for r in records if r["chooser"] == name}
-    ours, theirs = runs("select"), runs(chooser)
+    ours, theirs = runs(first), runs(second)
     both = sorted(set(ours) & set(theirs))
-    if not both:
-        return ""
+    if first == second or not both:
+        return None
     pair = [_scores([runs[key] for key in both], "psnr") for runs in (ours, theirs)]
-    return _text(paired_difference(pair[0], pair[1]), "+")
+    return paired_difference(pair[0], pair[1])
+
+
+def lead(records: Sequence[Record], first: str, second: str) -> str:
+    """The same as text; nothing where the two have no runs in common."""
+    found = difference(records, first, second)
+    return "" if found is None else _text(found, "+")
 
 
 def _text(found: Estimate, sign: str = "") -> str:
