@@ -162,12 +162,18 @@ def _after(observed: Observed, targets: Targets, frames: np.ndarray) -> np.ndarr
 
 def component_of(observed: Observed) -> np.ndarray:
     """Labels the scene of each frame, [n]: frames that a chain of common surfaces connects."""
-    frame, row = observed.frame[observed.is_colored], observed.row[observed.is_colored]
-    size = len(observed) + observed.num_rows
-    links = (np.ones(len(frame), dtype=bool), (frame, len(observed) + row))
-    graph = sparse.coo_matrix(links, (size, size))
-    labels = connected_components(graph, directed=False)[1][: len(observed)]
-    return np.unique(labels, return_inverse=True)[1]
+    count = len(observed)
+    first_of = np.full(observed.num_rows, -1, np.int64)  # the first frame that shows a row
+    links: list[np.ndarray] = []
+    for frame in range(count):
+        part = slice(int(observed.first[frame]), int(observed.first[frame + 1]))
+        row = observed.row[part][observed.is_colored[part]]
+        first_of[row[first_of[row] < 0]] = frame
+        shown = np.unique(first_of[row])
+        links.append(np.stack([np.full(len(shown), frame), shown]))
+    pairs = np.concatenate(links, axis=1)
+    graph = sparse.coo_matrix((np.ones(pairs.shape[1], dtype=bool), tuple(pairs)), (count, count))
+    return connected_components(graph, directed=False)[1]
 
 
 def in_proportion(sizes: np.ndarray, num: int) -> np.ndarray:

@@ -151,20 +151,28 @@ def observe(
     row_of = np.full(whole.capacity, -1, np.int32)
     row_of[occupied] = np.arange(len(occupied), dtype=np.int32)
     nothing = blank(whole)
-    parts: list[tuple[np.ndarray, ...]] = []
+    parts: tuple[list[np.ndarray], ...] = tuple([] for _ in range(5))
     for number in range(count):
-        parts.append(_part(join(nothing, whole, read(number)), row_of))
+        for column, own in zip(
+            parts, _part(join(nothing, whole, read(number)), row_of), strict=True
+        ):
+            column.append(own)
         on_frame()
-    row, direction, resolution, color, is_colored = (
-        np.concatenate(column) for column in zip(*parts, strict=True)
-    )
-    first = np.cumsum([0, *(len(part[0]) for part in parts)])
+    first = np.cumsum([0, *map(len, parts[0])])
+    row, direction, resolution, color, is_colored = map(_joined, parts)
     size = float(whole.voxel_size)
     sharp = np.ones(count, np.float32)
     return Observed(
         key[:, occupied], size, whole.num_bins, first, row, direction, resolution, color,
         is_colored, sharp,
     )  # fmt: skip
+
+
+def _joined(parts: list[np.ndarray]) -> np.ndarray:
+    """Concatenates the parts of a column and lets them go: long captures have gigabytes."""
+    whole = np.concatenate(parts)
+    parts.clear()
+    return whole
 
 
 def ordered_rows(whole: MapState) -> np.ndarray:

@@ -31,6 +31,9 @@ from r3jax.captures.faults.faults import BLURRED
 _FEWEST = 40
 """Surfaces shared with other frames below which no exposure is fitted."""
 
+_MOST_COMPARED = 10_000_000
+"""Observations that gains are fitted to: of more, those of every second, third, ... surface."""
+
 _DARK, _BRIGHT = 0.05, 0.95
 """Colors beyond these are clipped, or nearly, and say little of a gain."""
 
@@ -144,13 +147,12 @@ def with_quality(observed: Observed, blur: np.ndarray, exposure: np.ndarray) -> 
         blur: [n] [px].
         exposure: [n, 3].
     """
-    frame = observed.frame
-    return dataclasses.replace(
-        observed,
-        resolution=(observed.resolution / blur[frame]).astype(np.float32),
-        sharpness=(observed.sharpness / blur).astype(np.float32),
-        color=(observed.color / exposure[frame]).astype(np.float32),
-    )
+    resolution, color = observed.resolution.copy(), observed.color.copy()
+    for number, part in enumerate(map(slice, observed.first[:-1], observed.first[1:])):
+        resolution[part] /= np.float32(blur[number])
+        color[part] /= exposure[number].astype(np.float32)
+    sharpness = (observed.sharpness / blur).astype(np.float32)
+    return dataclasses.replace(observed, resolution=resolution, sharpness=sharpness, color=color)
 
 
 def exposures(observed: Observed) -> np.ndarray:
@@ -159,7 +161,9 @@ def exposures(observed: Observed) -> np.ndarray:
     The median over the surfaces, in turn with the means; gains of the median frame are 1. A frame
     that shares few surfaces with others has 1.
     """
-    used = observed.is_colored & (observed.color > _DARK).all(axis=1)
+    stride = max(1, -(-len(observed.row) // _MOST_COMPARED))
+    used = observed.is_colored & (observed.row % stride == 0)
+    used &= (observed.color > _DARK).all(axis=1)
     used &= (observed.color < _BRIGHT).all(axis=1)
     used &= np.bincount(observed.row[used], minlength=observed.num_rows)[observed.row] > 1
     row, frame = observed.row[used], observed.frame[used]
