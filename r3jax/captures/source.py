@@ -72,6 +72,12 @@ def thinned(camera: Camera, stride: int) -> Camera:
     return Camera(width, height, float(camera.fx) / stride, float(camera.fy) / stride, cx, cy)
 
 
+@functools.lru_cache(maxsize=64)
+def _thinned_pinhole(lens: Lens, stride: int) -> Camera:
+    """Returns the pinhole of a lens's thinned images; frames by the thousand share a lens."""
+    return thinned(lens.camera, stride)
+
+
 def taken(side: int, stride: int) -> np.ndarray:
     """Returns the indices of the pixels taken from `side` pixels in a row; at least one."""
     return np.arange(min(stride // 2, side - 1), side, stride)
@@ -331,7 +337,7 @@ class Source:
 
     def camera(self, index: int) -> Camera:
         """Returns the pinhole of a thinned image."""
-        return thinned(self.lenses[index].camera, self.stride)
+        return _thinned_pinhole(self.lenses[index], self.stride)
 
     def with_depth(self, scale: float = 1.0, *, is_along_ray: bool = False) -> "Source":
         """Returns the capture with its depth images converted; depth from points is refused.

@@ -298,7 +298,7 @@ def test_surfaces_of_photos_alone_may_be_points_or_swept(captures, tmp_path):
     assert record_of(tmp_path / "points")["surfaces_from"] == "tracks"
     capture = shared_path("recordings", "lounge_sfm")
     words = ["--frames", "5", "--out", str(tmp_path / "swept")]
-    assert main(["select", str(capture / "sparse" / "3"), *words]) == 0
+    assert main(["select", str(capture), *words]) == 0
     assert record_of(tmp_path / "swept")["surfaces_from"] == "sweep"
     assert "plane sweep" in (tmp_path / "swept" / "selection.html").read_text()
 
