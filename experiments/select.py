@@ -267,16 +267,34 @@ def run_cell(
     watch = _Watch()
     model = trained(pool.views.take(numbers), cell, options.gaussians)
     training = watch.seconds()
-    rows = evaluate(model, pool.views.take(pool.judging), lpips=lpips).rows
+    judging = pool.views.take(pool.judging)
+    found = evaluate(model, judging, lpips=lpips)
     columns = {
-        name: [round(float(value), 4) for row in rows if (value := getattr(row, name)) is not None]
+        name: [round(float(v), 4) for row in found.rows if (v := getattr(row, name)) is not None]
         for name in ("psnr", "ssim", "lpips")
     }
+    columns["exposed"] = [
+        round(exposed_psnr(*pair), 4)
+        for pair in zip(found.renders, np.asarray(judging.rgb), strict=True)
+    ]
     return {
         **cell._asdict(), "offered": len(pool.offered), "kept": len(numbers),
         "chosen": numbers.tolist(), **columns, "choosing": choosing, "training": training,
         "gaussians": options.gaussians, "commit": source_commit(), "machine": machine(),
     }  # fmt: skip
+
+
+def exposed_psnr(render: np.ndarray, truth: np.ndarray) -> float:
+    """PSNR after the gain of each channel that fits best [dB]: exposures differ between frames.
+
+    Args:
+        render: [H, W, 3] uint8.
+        truth: the same.
+    """
+    a, b = render.astype(np.float64), truth.astype(np.float64)
+    gain = (a * b).sum(axis=(0, 1)) / np.maximum((a * a).sum(axis=(0, 1)), 1.0)
+    error = np.mean((np.minimum(gain * a, 255.0) - b) ** 2)
+    return float(20.0 * np.log10(255.0 / np.sqrt(max(error, 1e-3))))
 
 
 _SHOWN = 512
@@ -353,8 +371,10 @@ def table(records: Sequence[Record], share: float) -> list[dict[str, Any]]:
         rows.append((psnr.value, {
             "chooser": chooser,
             "PSNR [dB]": _text(psnr),
+            "same exposure [dB]": f"{mean(lambda record: np.mean(record['exposed'])):.2f}",
             "minus all frames": lead(at, chooser, "all"),
             "select minus it": lead(at, "select", chooser),
+            "the same at the same exposure": lead(at, "select", chooser, "exposed"),
             "10th percentile": f"{mean(_worst_tenth):.2f}",
             "SSIM": f"{mean(lambda record: np.mean(record['ssim'])):.3f}",
             "LPIPS": f"{mean(lambda record: np.mean(record['lpips'])):.3f}"
@@ -383,20 +403,22 @@ def _scores(records: Sequence[Record], metric: str) -> dict[str, np.ndarray]:
     return {c: np.array([r[metric] for r in ordered if r["capture"] == c]) for c in captures}
 
 
-def difference(records: Sequence[Record], first: str, second: str) -> Estimate | None:
+def difference(
+    records: Sequence[Record], first: str, second: str, metric: str = "psnr"
+) -> Estimate | None:
     """PSNR of one chooser minus another's on the same frames, captures and seeds [dB]."""
     runs = lambda name: {(r["capture"], r["seed"]): r for r in records if r["chooser"] == name}
     ours, theirs = runs(first), runs(second)
     both = sorted(set(ours) & set(theirs))
     if first == second or not both:
         return None
-    pair = [_scores([runs[key] for key in both], "psnr") for runs in (ours, theirs)]
+    pair = [_scores([runs[key] for key in both], metric) for runs in (ours, theirs)]
     return paired_difference(pair[0], pair[1])
 
 
-def lead(records: Sequence[Record], first: str, second: str) -> str:
+def lead(records: Sequence[Record], first: str, second: str, metric: str = "psnr") -> str:
     """The same as text; nothing where the two have no runs in common."""
-    found = difference(records, first, second)
+    found = difference(records, first, second, metric)
     return "" if found is None else _text(found, "+")
 
 

@@ -6,7 +6,16 @@ import json
 import numpy as np
 import pytest
 
-from experiments.select import CHOICES, Cell, Options, by_capture, main, open_pool, table
+from experiments.select import (
+    CHOICES,
+    Cell,
+    Options,
+    by_capture,
+    exposed_psnr,
+    main,
+    open_pool,
+    table,
+)
 from tests.apps.audit.room import round_poses, write_recording
 
 pytestmark = pytest.mark.full
@@ -54,7 +63,7 @@ def test_leads_pair_the_same_captures_and_seeds():
     def record(capture, chooser, seed, psnr):
         cell = Cell(capture, chooser, 0.1, seed, 2, 32)
         seconds = {"wall": 1.0, "cpu": 1.0}
-        return {**cell._asdict(), "psnr": psnr, "ssim": [0.5, 0.5], "lpips": [],
+        return {**cell._asdict(), "psnr": psnr, "exposed": psnr, "ssim": [0.5, 0.5], "lpips": [],
                 "choosing": seconds, "training": seconds}  # fmt: skip
 
     records = [
@@ -66,6 +75,13 @@ def test_leads_pair_the_same_captures_and_seeds():
     assert rows["uniform"]["select minus it"].startswith("+0.50 ")
     assert rows["select"]["trainings"] == 3
     assert by_capture(records, 0.1)[0] == {"chooser": "select", "a": "22.00", "b": "60.00"}
+
+
+def test_a_gain_of_each_channel_does_not_count_where_exposures_differ():
+    truth = np.random.default_rng(0).integers(40, 160, (12, 16, 3)).astype(np.uint8)
+    brighter = np.rint(truth * np.array([1.3, 1.2, 0.8])).astype(np.uint8)
+    assert exposed_psnr(brighter, truth) > 50.0
+    assert exposed_psnr(truth[::-1], truth) < 20.0
 
 
 def test_an_unknown_chooser_is_refused(options):
