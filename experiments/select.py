@@ -368,21 +368,21 @@ def table(records: Sequence[Record], share: float) -> list[dict[str, Any]]:
         own = [r for r in at if r["chooser"] == chooser]
         psnr = mean_over_scenes(_scores(own, "psnr"))
         mean = functools.partial(_over_captures, own)
-        rows.append((psnr.value, {
+        row = {
             "chooser": chooser,
             "PSNR [dB]": _text(psnr),
-            "same exposure [dB]": f"{mean(lambda record: np.mean(record['exposed'])):.2f}",
             "minus all frames": lead(at, chooser, "all"),
             "select minus it": lead(at, "select", chooser),
-            "the same at the same exposure": lead(at, "select", chooser, "exposed"),
             "10th percentile": f"{mean(_worst_tenth):.2f}",
             "SSIM": f"{mean(lambda record: np.mean(record['ssim'])):.3f}",
             "LPIPS": f"{mean(lambda record: np.mean(record['lpips'])):.3f}"
             if all(r["lpips"] for r in own) else "–",
             "choosing [CPU s]": f"{np.median([r['choosing']['cpu'] for r in own]):.0f}",
             "training [CPU s]": f"{np.median([r['training']['cpu'] for r in own]):.0f}",
+            "captures": len({r["capture"] for r in own}),
             "trainings": len(own),
-        }))  # fmt: skip
+        }  # fmt: skip
+        rows.append((psnr.value, row))
     return [row for _, row in sorted(rows, key=lambda entry: -entry[0])]
 
 
@@ -403,22 +403,20 @@ def _scores(records: Sequence[Record], metric: str) -> dict[str, np.ndarray]:
     return {c: np.array([r[metric] for r in ordered if r["capture"] == c]) for c in captures}
 
 
-def difference(
-    records: Sequence[Record], first: str, second: str, metric: str = "psnr"
-) -> Estimate | None:
+def difference(records: Sequence[Record], first: str, second: str) -> Estimate | None:
     """PSNR of one chooser minus another's on the same frames, captures and seeds [dB]."""
     runs = lambda name: {(r["capture"], r["seed"]): r for r in records if r["chooser"] == name}
     ours, theirs = runs(first), runs(second)
     both = sorted(set(ours) & set(theirs))
     if first == second or not both:
         return None
-    pair = [_scores([runs[key] for key in both], metric) for runs in (ours, theirs)]
+    pair = [_scores([runs[key] for key in both], "psnr") for runs in (ours, theirs)]
     return paired_difference(pair[0], pair[1])
 
 
-def lead(records: Sequence[Record], first: str, second: str, metric: str = "psnr") -> str:
+def lead(records: Sequence[Record], first: str, second: str) -> str:
     """The same as text; nothing where the two have no runs in common."""
-    found = difference(records, first, second, metric)
+    found = difference(records, first, second)
     return "" if found is None else _text(found, "+")
 
 
@@ -426,15 +424,17 @@ def _text(found: Estimate, sign: str = "") -> str:
     return f"{found.value:{sign}.2f} [{found.low:{sign}.2f}, {found.high:{sign}.2f}]"
 
 
-def by_capture(records: Sequence[Record], share: float) -> list[dict[str, Any]]:
-    """Mean PSNR of each chooser on each capture at a share."""
+def by_capture(
+    records: Sequence[Record], share: float, metric: str = "psnr"
+) -> list[dict[str, Any]]:
+    """Mean of a metric of each chooser on each capture at a share."""
     captures = list(dict.fromkeys(r["capture"] for r in records))
     rows: list[dict[str, Any]] = []
     for chooser in dict.fromkeys(r["chooser"] for r in records):
         own = [r for r in records if r["chooser"] == chooser and r["share"] in (share, 1.0)]
         row: dict[str, Any] = {"chooser": chooser}
         for capture in captures:
-            found = [np.mean(r["psnr"]) for r in own if r["capture"] == capture]
+            found = [np.mean(r[metric]) for r in own if r["capture"] == capture and r.get(metric)]
             row[capture] = f"{np.mean(found):.2f}" if found else "–"
         rows.append(row)
     return rows
@@ -450,6 +450,8 @@ def write_page(records: Sequence[Record], folder: Path) -> None:
                 f"## {100 * share:g} % of the frames, {terms[0]} iterations at {terms[1]} px"
             )
             lines += [markdown_table(table(some, share)), markdown_table(by_capture(some, share))]
+            lines.append("PSNR after the gain of each channel that fits best:")
+            lines.append(markdown_table(by_capture(some, share, "exposed")))
     commits = [r["commit"] for r in records]
     origin = joint_origin(f"experiments.{NAME}", [r["machine"] for r in records], commits)
     write_markdown(folder / "tables.md", lines, origin)
