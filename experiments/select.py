@@ -361,8 +361,16 @@ def run(options: Options, path: Path) -> None:
 
 
 def table(records: Sequence[Record], share: float) -> list[dict[str, Any]]:
-    """One row per chooser at a share, the best first: means over the captures, with intervals."""
+    """One row per chooser at a share, the best first: means over the captures, with intervals.
+
+    Of captures where all choosers are done: means over others could not be compared.
+    """
     at = [r for r in records if r["share"] in (share, 1.0)]
+    choosers = {r["chooser"] for r in at}
+    captures = {
+        r["capture"]: {o["chooser"] for o in at if o["capture"] == r["capture"]} for r in at
+    }
+    at = [r for r in at if captures[r["capture"]] == choosers]
     rows: list[tuple[float, dict[str, Any]]] = []
     for chooser in dict.fromkeys(r["chooser"] for r in at):
         own = [r for r in at if r["chooser"] == chooser]
