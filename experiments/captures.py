@@ -35,11 +35,11 @@ from experiments.pages.artifacts import (
     write_figure,
     write_markdown,
 )
-from experiments.pages.benchmark_figures import curve_figure
 from experiments.pages.comparison_tables import ause_of_renderability
 from experiments.suite import Options as SuiteOptions
 from experiments.suite import Records, origin, request_of, run_cells, take_over
 from r3jax.apps.benchmark.cells import Cell, paths_of
+from r3jax.apps.benchmark.figures import curve_figure
 from r3jax.apps.benchmark.plan import make_plan
 from r3jax.apps.benchmark.record import read_records, write_records
 from r3jax.apps.benchmark.tables import metric_named

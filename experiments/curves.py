@@ -1,20 +1,9 @@
-"""Curves of a quality over a budget, and areas that sum up a curve: AUSE, and quality over it."""
+"""Areas that sum up a curve: AUSE, and quality over a budget."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-
-from r3jax.evaluation.comparison import Cell, snapshots_of, view_values
-
-EXPLORATION = {
-    "views": "views",
-    "seconds": "mission clock [s]",
-    "metres": "path [m]",
-    "known_share": "share of the box explored",
-    "mean_renderability": "mean renderability",
-}
-"""Quantities of a record's exploration, and their names on axes."""
 
 
 @dataclass(frozen=True)
@@ -143,33 +132,3 @@ def common_range(budgets: Sequence[np.ndarray]) -> tuple[float, float]:
             f"the curves share no range of budgets: one starts at {start:g}, one ends at {end:g}"
         )
     return float(start), float(end)
-
-
-def snapshot_kind(cells: Sequence[Cell]) -> str:
-    """Returns what the snapshots count: views, seconds or meters.
-
-    Raises:
-        ValueError: the kinds differ; then they are no points of one curve.
-    """
-    kinds = sorted({snapshot.partition(":")[0] for snapshot in snapshots_of(cells)})
-    if len(kinds) > 1:
-        raise ValueError(f"a curve has snapshots of one kind, got {' and '.join(kinds)}")
-    return kinds[0]
-
-
-def values_by_seed(cells: Sequence[Cell], quantity: str) -> np.ndarray:
-    """Returns a quantity of one method in one scene, [seeds, snapshots]; NaN where there is none.
-
-    Args:
-        cells: of one method and scene.
-        quantity: of `EXPLORATION`, or a column of the test views, then its mean.
-    """
-    seeds, snapshots = sorted({cell["seed"] for cell in cells}), snapshots_of(cells)
-    values = np.full((len(seeds), len(snapshots)), np.nan)
-    for cell in cells:
-        place = seeds.index(cell["seed"]), snapshots.index(cell["snapshot"])
-        if quantity in EXPLORATION:
-            values[place] = cell["exploration"][quantity]
-        elif (views := view_values(cell, quantity)) is not None and not np.isnan(views).all():
-            values[place] = np.nanmean(views)
-    return values

@@ -24,7 +24,7 @@ from experiments.pages.artifacts import (
     write_figure,
     write_markdown,
 )
-from experiments.pages.benchmark_figures import latency_figure
+from experiments.pages.cost_figures import latency_figure
 from experiments.planner_runs import PLANNING, SIZES, STAGES, Options, bucket_of, fly_all
 
 NAME = "planner_latency"

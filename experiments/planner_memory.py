@@ -23,7 +23,7 @@ from experiments.pages.artifacts import (
     write_figure,
     write_markdown,
 )
-from experiments.pages.benchmark_figures import memory_figure
+from experiments.pages.cost_figures import memory_figure
 from experiments.planner_runs import Options, fly_all
 
 NAME = "planner_memory"

@@ -10,11 +10,11 @@ from pathlib import Path
 import tyro
 
 from experiments.pages.artifacts import Origin, write_figure, write_markdown
-from experiments.pages.benchmark_figures import curve_figure
 from experiments.pages.comparison_tables import area_table
 from experiments.pages.distribution_figures import ridge_figure
-from experiments.pages.table_formats import to_csv, to_markdown
 from experiments.suite import Options, Records, origin, run_suite
+from r3jax.apps.benchmark.figures import curve_figure
+from r3jax.apps.benchmark.table_formats import to_csv, to_markdown
 from r3jax.files import write_atomic
 
 NAME = "quality_over_budget"

@@ -33,9 +33,9 @@ from experiments.pages.artifacts import (
     write_figure,
     write_markdown,
 )
-from experiments.pages.policy_style import OKABE_ITO, legend_below
 from experiments.suite import Options, Records, origin, run_suite
 from r3jax.apps.benchmark.cells import Conditions
+from r3jax.apps.benchmark.policy_style import OKABE_ITO, legend_below
 from r3jax.apps.benchmark.reference_images import read_reference_images, reference_path
 from r3jax.apps.benchmark.tables import notes
 from r3jax.apps.forecast.forecast import view_features

@@ -6,9 +6,9 @@ from typing import Literal
 from experiments.flights import keep_flights
 from experiments.pages.artifacts import Origin, write_markdown
 from experiments.pages.comparison_tables import difference_table, tail_table
-from experiments.pages.table_formats import to_csv, to_latex, to_markdown
 from experiments.suite import Options, Records, origin, request_of, run_requests
 from r3jax.apps.benchmark.record import write_records
+from r3jax.apps.benchmark.table_formats import to_csv, to_latex, to_markdown
 from r3jax.apps.benchmark.tables import Table, quality_table
 from r3jax.evaluation.comparison import methods_of, snapshots_of
 from r3jax.files import write_atomic

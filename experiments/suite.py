@@ -10,7 +10,7 @@ from r3jax.apps.benchmark.cells import Cell, Conditions, paths_of, snapshots_lef
 from r3jax.apps.benchmark.engines.local import Event, run_in_processes
 from r3jax.apps.benchmark.engines.slurm import run_on_cluster
 from r3jax.apps.benchmark.plan import Request, cells_left, make_plan
-from r3jax.apps.benchmark.record import collect, read_lines, read_records, write_record
+from r3jax.apps.benchmark.record import collect, read_records, write_record
 from r3jax.planning.registry import policy_names
 from r3jax.simulators.scenes.registry import scene_names
 
@@ -209,7 +209,7 @@ def take_over(files: Sequence[Path], root: Path, cells: Sequence[Cell]) -> None:
         ValueError: a line is no record.
         OSError: a file cannot be read.
     """
-    found = {(r["run"], r["snapshot"]): r for file in files for r in read_lines(file)}
+    found = {(r["run"], r["snapshot"]): r for file in files for r in read_records(file)}
     for cell in cells:
         paths = paths_of(root, cell)
         for snapshot in snapshots_left(root, cell):

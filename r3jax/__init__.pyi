@@ -1,3 +1,4 @@
+from .apps.benchmark.record import read_records
 from .apps.forecast.expected_error import (
     ErrorImages,
     ExpectedError,
@@ -111,6 +112,7 @@ __all__ = [
     "open_scene",
     "panorama",
     "pose_along",
+    "read_records",
     "read_scene",
     "rebuild",
     "refuse",

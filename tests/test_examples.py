@@ -46,3 +46,24 @@ def test_a_planar_robot_keeps_out_of_the_zone_and_its_map_is_saved(tmp_path):
     assert len(track) == 11
     assert np.linalg.norm(np.diff(track, axis=0), axis=1).sum() > 2.0
     assert int(r3jax.load(tmp_path / "map").map_state.num_occupied) > 1000
+
+
+class Trial:
+    """As much of Optuna's trial as the example uses."""
+
+    def suggest_float(self, name, low, high, log):
+        return low if name == "lambda2" else high
+
+    def suggest_int(self, name, low, high):
+        return low
+
+
+def test_a_trial_of_a_search_is_the_mean_of_its_cells(tmp_path):
+    terms = "--scenes flat --budget views:3 --clock model --resolution 32 --train-resolution 32"
+    terms += " --iterations 20 --gaussians 200 --capacity 400 --test-views 6 --lpips none --jobs 0"
+    search = load("optuna_search")
+    found = search.objective(Trial(), terms.split(), tmp_path)
+    (record,) = r3jax.read_records(tmp_path)
+    assert record["settings"] == {"lambda2": 0.1, "num_candidates": 40}
+    assert found == record["metrics"]["psnr"]["mean"]
+    assert search.objective(Trial(), terms.split(), tmp_path) == found  # nothing is done twice

@@ -8,14 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from experiments.curves import (
-    EXPLORATION,
-    area_under,
-    common_range,
-    snapshot_kind,
-    sparsification,
-    values_by_seed,
-)
+from experiments.curves import area_under, common_range, sparsification
+from r3jax.apps.benchmark.figures import EXPLORATION, snapshot_kind, values_by_seed
 from r3jax.apps.benchmark.tables import (
     MISSING,
     Entry,

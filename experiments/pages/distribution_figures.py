@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.pages.policy_style import styles_of
+from r3jax.apps.benchmark.policy_style import styles_of
 from r3jax.apps.benchmark.tables import full_title, metric_named
 from r3jax.evaluation.comparison import (
     Cell,

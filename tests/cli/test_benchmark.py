@@ -1,11 +1,13 @@
 """`r3jax benchmark`, as a user meets it: a table at the end, nothing done twice, mistakes named."""
 
+import csv
 import io
 import json
 import os
 
 import pytest
 
+import r3jax
 from r3jax.apps.benchmark import run_cell as running
 from r3jax.apps.benchmark.record import CELLS
 from r3jax.cli.commands.benchmark import beside, print_results
@@ -68,6 +70,61 @@ def test_the_same_words_again_do_nothing_and_show_the_table(room, finished, monk
     assert "2 cells, 2 of them done" in captured.err
     for word in ("PSNR", "SSIM", "random", "frontier", "views:2", "views:3", "room"):
         assert word in captured.out
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("form", ["csv", "latex", "markdown"])
+def test_tables_are_printed_for_other_programs(room, finished, capsys, form):
+    words = ("--format", form, "--reference", "random")
+    assert benchmark(room, finished, *words, snapshots="views:2,views:3") == 0
+    text = capsys.readouterr().out
+    if form != "csv":
+        begin = {"latex": r"\begin{table}", "markdown": "| method |"}[form]
+        assert text.count(begin) == 4  # quality and costs, at two snapshots
+        return
+    lines = list(csv.DictReader(io.StringIO(text)))
+    assert [(line["terms"], line["scene"], line["method"]) for line in lines] == [
+        (snapshot, "room", policy)
+        for snapshot in ("views:2", "views:3")
+        for policy in ("random", "frontier")
+    ]
+    for line in lines:
+        (found,) = (
+            r for r in r3jax.read_records(finished)
+            if (r["policy"], r["snapshot"]) == (line["method"], line["terms"])
+        )  # fmt: skip
+        assert float(line["PSNR [dB]"]) == pytest.approx(found["metrics"]["psnr"]["mean"])
+        assert float(line["decision [ms]"]) == found["exploration"]["decision_ms"] > 0.0
+        assert (line["minus reference"] == "") == (line["method"] == line["reference"] == "random")
+
+
+@pytest.mark.full
+def test_every_value_of_a_sweep_makes_a_cell(room, tmp_path, capsys):
+    words = ("--sweep", "lambda2=0.2,0.8")
+    assert benchmark(room, tmp_path, *words, policies="r3-pano", seeds="0,1") == 0
+    found = sorted((r["settings"]["lambda2"], r["seed"]) for r in read(tmp_path))
+    assert found == [(0.2, 0), (0.2, 1), (0.8, 0), (0.8, 1)]
+    out = capsys.readouterr().out
+    assert "r3-pano (lambda2=0.2)" in out
+    assert "r3-pano (lambda2=0.8)" in out
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--sweep", "lambda2"),
+        ("--sweep", "lambda2=0.2,0.2"),
+        ("--sweep", "lambda2=0.2", "--sweep", "lambda2=0.3"),
+        ("--sweep", "num_candidates=3"),  # --settings has it
+        ("--sweep", "lambda2=0.2,much"),
+        ("--reference", "frontier (lambda2=1)"),
+    ],
+)
+def test_a_sweep_or_reference_that_cannot_work_starts_nothing(room, tmp_path, capsys, words):
+    assert benchmark(room, tmp_path, *words) == 2
+    told = capsys.readouterr().err
+    assert words[-1].partition("=")[0] in told
+    assert not (tmp_path / "cells").exists()
 
 
 @pytest.mark.full
@@ -155,7 +212,7 @@ def test_a_corrected_submission_does_not_keep_others_from_their_table():
     chosen = beside([bob], [alice, corrected, bob])
     assert chosen == [bob, alice, corrected]
     told = shown(chosen)
-    assert told.count("alice (submitted)") == 2
+    assert told.count("alice (submitted)") == 4  # in two tables of each group
     assert "table 2 on the same terms" in told
     assert beside([corrected], [alice, corrected, bob]) == [corrected, alice, bob]
 

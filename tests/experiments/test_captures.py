@@ -9,7 +9,7 @@ from experiments import captures, flights
 from experiments.captures import TABLES, Options, Row, as_line, quality_rows, rows_of
 from experiments.suite import request_of
 from r3jax.apps.benchmark.cells import paths_of, snapshots_left
-from r3jax.apps.benchmark.record import read_lines, write_record
+from r3jax.apps.benchmark.record import read_records, write_record
 from tests.evaluation.records import record as benchmark_record
 from tests.formats.test_submissions import make_submission
 
@@ -116,7 +116,7 @@ def test_what_another_machine_made_is_not_run_again(tmp_path, monkeypatch):
     assert "11.00 / 21.00" in (folder / "rivals.md").read_text()
     assert (folder / flight).read_text() == "as it was flown there"
     assert (folder / "rivals_flights/gavis_flat_1.jsonl").exists()
-    assert [(r["seed"], r["snapshot"]) for r in read_lines(folder / name)] == [
+    assert [(r["seed"], r["snapshot"]) for r in read_records(folder / name)] == [
         (seed, f"seconds:{seconds}") for seed in (0, 1) for seconds in (30, 60)
     ]
     # A table may take over what it holds itself.

@@ -11,7 +11,7 @@ from experiments import degeneracy, quality_over_budget, replica_dense
 from experiments.pages.artifacts import Origin
 from experiments.suite import HOUSE, Options, take_over
 from r3jax.apps.benchmark.cells import Cell, Conditions, paths_of, snapshots_left
-from r3jax.apps.benchmark.record import read_lines, read_records, write_record, write_records
+from r3jax.apps.benchmark.record import read_records, write_record, write_records
 from r3jax.runs.writer import RunWriter
 from r3jax.simulators.scenes.registry import open_world
 from tests.evaluation.records import record
@@ -143,6 +143,6 @@ def test_positions_come_from_the_runs_up_to_the_snapshot(tmp_path):
 def test_the_house_of_the_tables_comes_with_the_repository(monkeypatch):
     monkeypatch.chdir(ROOT)
     files = list((ROOT / "experiments/results").rglob("*_records.jsonl"))
-    rows = [row for path in files for row in read_lines(path)]
+    rows = [row for path in files for row in read_records(path)]
     hashes = {row["scene_hash"] for row in rows if row["scene"] == "aws_small_house"}
     assert hashes == {open_world(HOUSE).content_hash}

@@ -45,6 +45,15 @@ class Request:
     settings: dict[str, Any] = field(default_factory=dict[str, Any])
     """Settings of all policies that differ from their defaults."""
 
+    sweeps: dict[str, list[Any]] = field(default_factory=dict[str, list[Any]])
+    """Values to try of further settings, by name: all combinations make cells."""
+
+    @property
+    def points(self) -> list[dict[str, Any]]:
+        """The settings of each combination; the last swept one varies fastest."""
+        tried = itertools.product(*self.sweeps.values())
+        return [self.settings | dict(zip(self.sweeps, values, strict=True)) for values in tried]
+
     up: str | None = None
     """Vertical axis of mesh files; None: as their format has it."""
 
@@ -75,13 +84,16 @@ def make_plan(
             raise InputError(f"there is nothing to do: no {name} are given")
         if len(set(given)) < len(given):
             raise InputError(f"{name} holds something twice: {', '.join(map(str, given))}")
-    for policy in request.policies:  # what can be checked quickly comes before the scenes
-        request.conditions.policy(policy, request.settings)
+    for policy, point in itertools.product(request.policies, request.points):
+        # What can be checked quickly comes before the scenes.
+        request.conditions.policy(policy, point)
     sources = {policy: sources_of(policy) for policy in request.policies}
     cells: list[Cell] = []
     for scene in request.scenes:
         view_set = prepare_scene(request, scene, root, on_stage)
-        for policy, seed in itertools.product(request.policies, request.seeds):
+        for policy, point, seed in itertools.product(
+            request.policies, request.points, request.seeds
+        ):
             cells.append(
                 Cell(
                     scene=scene,
@@ -91,7 +103,7 @@ def make_plan(
                     conditions=request.conditions,
                     test_views_hash=view_set.hash,
                     num_test_views=len(view_set),
-                    settings=request.settings,
+                    settings=point,
                     up=request.up,
                     scale=request.scale,
                     cull_backfaces=request.cull_backfaces,

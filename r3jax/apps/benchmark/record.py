@@ -9,6 +9,7 @@ import platform
 import subprocess
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
+from statistics import median
 from typing import Any
 
 from r3jax.apps.benchmark.cells import Cell, paths_of, snapshot_order
@@ -57,6 +58,7 @@ def make_record(
     steps: Sequence[StepRow],
     outcome: str,
     rows: Sequence[ViewRow],
+    decision_seconds: Sequence[float] = (),
 ) -> dict[str, Any]:
     """Makes the record of a snapshot.
 
@@ -67,6 +69,7 @@ def make_record(
         steps: rows of the exploration up to the snapshot, at least one.
         outcome: why it ended there.
         rows: one per test view.
+        decision_seconds: what the decisions took on this machine; none: not known.
     """
     conditions, last = cell.conditions, steps[-1]
     return {
@@ -107,8 +110,10 @@ def make_record(
             "radians": last.radians,
             "known_share": last.coverage.known_share,
             "mean_renderability": last.coverage.mean_renderability,
+            "map_bytes": last.coverage.map_bytes,
             "outcome": outcome,
-        },
+        }
+        | ({"decision_ms": 1e3 * median(decision_seconds)} if decision_seconds else {}),
         "metrics": _metrics(rows),
         "views": _columns(rows),
         "run": paths_of(root, cell).run.relative_to(root).as_posix(),
@@ -152,16 +157,22 @@ def write_record(path: Path, record: dict[str, Any]) -> None:
 
 
 def read_records(root: Path, cells: Iterable[Cell] | None = None) -> list[dict[str, Any]]:
-    """Reads the records that are there, ordered by the folder's name, then by snapshot.
+    """Reads the records of a benchmark, ordered by the cells' names, then by snapshot.
+
+    A record is a dictionary: `scene`, `policy`, `settings`, `seed`, `snapshot`, what the views
+    cost (`exploration`), each metric's mean, interval and tail (`metrics`), and its value in each
+    test view (`views`). `pandas.json_normalize(records)` makes a table of them.
 
     Args:
-        root: folder of the benchmark.
+        root: folder of a benchmark, or a `cells.jsonl` that lies elsewhere.
         cells: whose records; None: all that were ever made there.
 
     Raises:
         ValueError: a record is damaged; the message names it.
         OSError: a record cannot be read.
     """
+    if Path(root).is_file():
+        return _read_lines(root)
     if cells is None:
         folders = [path for path in (Path(root) / "cells").glob("*") if path.is_dir()]
     else:
@@ -231,7 +242,7 @@ def write_records(path: Path, records: Iterable[Mapping[str, Any]]) -> None:
     write_atomic(path, "".join(lines).encode())
 
 
-def read_lines(path: Path) -> list[dict[str, Any]]:
+def _read_lines(path: Path) -> list[dict[str, Any]]:
     """Reads the records of a file that `write_records` wrote.
 
     Raises:

@@ -308,7 +308,9 @@ def _do_snapshot(
     )
     assert run.end is not None
     outcome = run.end.outcome if len(steps) == len(run.rows) else StopReason.BUDGET.value
-    record = make_record(root, cell, snapshot, steps, outcome, evaluation.rows)
+    timings = [stages for stages in run.timings if stages.get("step", 0) < len(steps)]
+    decisions = [stages["plan"] for stages in timings if "plan" in stages]
+    record = make_record(root, cell, snapshot, steps, outcome, evaluation.rows, decisions)
     if cell.submission is not None:
         record |= {"submission": _submission_fields(load_submission(root, cell.submission), run)}
     write_record(paths.record(snapshot), record)

@@ -1,4 +1,4 @@
-"""Writes a static page of a benchmark's records: the tables, with the worst view of each row."""
+"""Writes a static page of a benchmark's records: tables to download, curves, and worst views."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,26 +6,38 @@ from typing import Any
 
 import jax
 import numpy as np
+from matplotlib.figure import Figure
 
 from r3jax.apps.benchmark.cells import snapshot_slug
-from r3jax.apps.benchmark.record import read_records
+from r3jax.apps.benchmark.figures import curve_figure, curves_of, response_figures
+from r3jax.apps.benchmark.record import CELLS, read_records, write_records
 from r3jax.apps.benchmark.reference_images import path_of_images, read_reference_images
-from r3jax.apps.benchmark.tables import headed_groups, quality_table
+from r3jax.apps.benchmark.table_formats import to_csv, to_latex, to_markdown
+from r3jax.apps.benchmark.tables import (
+    by_scene_table,
+    comparison_table,
+    headed_groups,
+    quality_table,
+    reference_in,
+    without_empty_columns,
+)
 from r3jax.errors import InputError
 from r3jax.evaluation.comparison import Cell, methods_of, view_values, with_short_names
 from r3jax.files import check_own, make_folder, own_folder, write_atomic
 from r3jax.plots import page
+from r3jax.plots.style import to_png
 from r3jax.runs.writer import encode_png
 from r3jax.splatting.ply import read_scene
 from r3jax.splatting.render import render
 
 
-def write_site(root: Path, folder: Path) -> Path:
-    """Writes the page, and the images beside it.
+def write_site(root: Path, folder: Path, reference: str | None = None) -> Path:
+    """Writes the page, and beside it the images, the records and the tables.
 
     Args:
         root: folder of the benchmark.
         folder: a new one, or that of an earlier page, which is replaced.
+        reference: method that the others are compared with; see `tables.reference_in`.
 
     Returns:
         The page.
@@ -42,13 +54,28 @@ def write_site(root: Path, folder: Path) -> Path:
         raise InputError(f"{root} holds no records of explorations: run the benchmark first")
     own_folder(path.parent, "site")
     make_folder(path.parent / "pictures")
-    groups = [
-        {
-            "table": quality_table(group, heading, with_intervals=True),
-            "views": _worst_views(root, group, path.parent),
-        }
-        for heading, group in headed_groups(records)
+    groups: list[dict[str, Any]] = []
+    for number, (heading, group) in enumerate(headed_groups(records)):
+        quality = quality_table(group, heading, with_intervals=True)
+        costs = without_empty_columns(
+            comparison_table(group, reference=reference_in(group, reference))
+        )
+        figures = {f"response-{number}-{k}": f for k, f in response_figures(group).items()}
+        groups.append(
+            {
+                "tables": [quality, costs],
+                "latex": to_latex(quality) + "\n" + to_latex(costs),
+                "markdown": to_markdown(quality) + "\n" + to_markdown(costs),
+                "figures": [_store(path.parent, name, figure) for name, figure in figures.items()],
+                "views": _worst_views(root, group, path.parent),
+            }
+        )
+    curves = [
+        _store(path.parent, f"curve-{n}", curve_figure(group, x))
+        for n, (x, group) in enumerate(curves_of(records))
     ]
+    write_records(path.parent / CELLS, records)
+    write_atomic(path.parent / "table.csv", to_csv(by_scene_table(records, reference)).encode())
     text = page.render(
         "apps/benchmark/site.html",
         kind="benchmark",
@@ -56,8 +83,17 @@ def write_site(root: Path, folder: Path) -> Path:
         lead=[],
         cards={},
         groups=groups,
+        curves=curves,
+        downloads={CELLS: "all records, a JSON object a line", "table.csv": "all tables as CSV"},
     )
     write_atomic(path, text.encode())
+    return path
+
+
+def _store(folder: Path, name: str, figure: Figure) -> str:
+    """Writes a figure, and returns its path from the page."""
+    path = f"pictures/{name}.png"
+    write_atomic(folder / path, to_png(figure))
     return path
 
 

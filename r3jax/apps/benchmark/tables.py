@@ -4,7 +4,7 @@ Fields have ranks, lines their seeds; notes tell the terms.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from r3jax.evaluation.comparison import (
     Cell,
     check_equal_terms,
     differing,
+    method_name,
     methods_of,
     scenes_of,
     scores_by_method,
@@ -23,8 +24,8 @@ from r3jax.evaluation.comparison import (
     terms_of,
     with_short_names,
 )
-from r3jax.evaluation.scores import METRICS, Metric
-from r3jax.evaluation.statistics import Estimate, Scores, mean_over_scenes
+from r3jax.evaluation.scores import METRICS, POOR_PSNR, Metric
+from r3jax.evaluation.statistics import Estimate, Scores, mean_over_scenes, paired_difference
 
 FEWEST_SEEDS = 3
 """That the protocol asks for in each cell of a table."""
@@ -170,14 +171,16 @@ def notes(cells: Sequence[Cell]) -> tuple[str, ...]:
     if absent:
         sentences.append(f"No record of {', '.join(absent)}.")
     machines = ", ".join(sorted({cell["machine"] or "an unknown machine" for cell in cells}))
-    commits = ", ".join(sorted({_short_commit(cell["commit"]) for cell in cells}))
-    return (*sentences, f"Made on {machines} from commit {commits}.")
+    sources = ", ".join(sorted({_source(cell) for cell in cells}))
+    return (*sentences, f"Made on {machines} from {sources}.")
 
 
-def _short_commit(commit: str | None) -> str:
-    """Shortens a commit to ten digits, and keeps the mark of a changed source."""
-    digits, hyphen, changed = (commit or "unknown").partition("-")
-    return f"{digits[:10]}{hyphen}{changed}"
+def _source(cell: Cell) -> str:
+    """Names the commit by ten digits and the mark of a changed source; else the version."""
+    if cell["commit"] is None:
+        return f"version {cell['packages'].get('r3jax', 'unknown')}"
+    digits, hyphen, changed = cell["commit"].partition("-")
+    return f"commit {digits[:10]}{hyphen}{changed}"
 
 
 PAPER_METRICS = ("ssim", "psnr", "lpips")
@@ -225,6 +228,161 @@ def quality_table(cells: Sequence[Cell], title: str = "", *, with_intervals: boo
         rows=tuple(rows[method, name] for method in methods for name in PAPER_METRICS),
         notes=told,
     )
+
+
+_COSTS = {
+    "path [m]": ("metres", 1.0, 1),
+    "clock [s]": ("seconds", 1.0, 0),
+    "views": ("views", 1.0, 0),
+    "decision [ms]": ("decision_ms", 1.0, 0),
+    "map [MB]": ("map_bytes", 1e-6, 0),
+}
+"""Columns of what the views cost: field of a record's `exploration`, factor, decimals."""
+
+
+def comparison_table(
+    cells: Sequence[Cell],
+    title: str = "",
+    *,
+    reference: str | None = None,
+    scenes: Sequence[str] | None = None,
+) -> Table:
+    """Makes the table that a comparison is read from: a line per method, means over the scenes.
+
+    PSNR with its interval, its difference to a reference on the same test views and seeds
+    (`statistics.paired_difference`; above 0: better than the reference), the other metrics, the
+    share of views under 20 dB, and what the views cost: path, mission clock, views, the median
+    decision as it was measured, and the memory of the map. A method without one of the scenes has
+    no numbers, since means over other scenes are not comparable.
+
+    Args:
+        cells: as in `quality_table`.
+        title: of the table; none given: the snapshot.
+        reference: a method as the tables call it; None: the last in the order of tables.
+        scenes: only these, by the names that tables use; None: all.
+
+    Raises:
+        ValueError: records not on equal terms, or a reference that is not there.
+    """
+    check_equal_terms(cells)
+    told, cells = notes(cells), with_short_names(cells)
+    chosen = list(scenes or scenes_of(cells))
+    cells = [cell for cell in cells if cell["scene"] in chosen]
+    methods, seeds = methods_of(cells), seed_texts(cells)
+    reference = methods[-1] if reference is None else reference
+    if reference not in methods:
+        raise InputError(f"there is no record of {reference!r}; there are {', '.join(methods)}")
+    columns: dict[str, list[Entry]] = {}
+    for name in ("psnr", "ssim", "lpips"):
+        metric, scores = metric_named(name), scores_by_method(cells, name)
+        complete = {m: scores[m] for m in methods if set(scores.get(m, ())) == set(chosen)}
+        entries = ranked([_mean(complete[m]) if m in complete else None for m in methods], metric)
+        if name != "psnr":
+            columns[metric.title] = entries
+            continue
+        columns[metric.title] = [
+            with_bounds(entry, mean_over_scenes(complete[m]), metric) if m in complete else entry
+            for m, entry in zip(methods, entries, strict=True)
+        ]
+        columns[f"minus {reference}"] = [
+            _entry_of_difference(difference_of(cells, m, reference), metric) for m in methods
+        ]
+        poor = {m: _mean({s: 100.0 * (v < POOR_PSNR) for s, v in complete[m].items()})
+                for m in complete}  # fmt: skip
+        share = Metric("", "", 0, lower_is_better=True)
+        columns[f"< {POOR_PSNR:g} dB [%]"] = ranked([poor.get(m) for m in methods], share)
+    for column, (name, factor, decimals) in _COSTS.items():
+        values = [_cost(cells, m, name, chosen) for m in methods]
+        columns[column] = [
+            MISSING if v is None else Entry(v * factor, f"{v * factor:.{decimals}f}")
+            for v in values
+        ]
+    lines = zip(methods, zip(*columns.values(), strict=True), strict=True)
+    return Table(
+        title=title or cells[0]["snapshot"],
+        heads=("method",),
+        columns=tuple(columns),
+        rows=tuple(Row((method,), seeds[method], entries) for method, entries in lines),
+        notes=told,
+    )
+
+
+def without_empty_columns(table: Table) -> Table:
+    """Leaves out the columns in which no line has a value."""
+    has_value = [
+        any(r.entries[i].value is not None for r in table.rows) for i in range(len(table.columns))
+    ]
+    kept = [i for i, known in enumerate(has_value) if known]
+    rows = [replace(row, entries=tuple(row.entries[i] for i in kept)) for row in table.rows]
+    return replace(table, columns=tuple(table.columns[i] for i in kept), rows=tuple(rows))
+
+
+def by_scene_table(records: Sequence[Cell], reference: str | None = None) -> Table:
+    """Makes one table for machines: a line per set of terms, scene and method.
+
+    The lines of `comparison_table` for every scene by itself, and for `all` where there are
+    several, of every group of `headed_groups`; `reference` is the method that is subtracted.
+    """
+    rows: list[Row] = []
+    columns: tuple[str, ...] = ()
+    for heading, group in headed_groups(records):
+        chosen = reference_in(group, reference)
+        scenes = scenes_of(with_short_names(group))
+        parts = {scene: [scene] for scene in scenes} | ({"all": scenes} if scenes[1:] else {})
+        for name, part in parts.items():
+            table = comparison_table(group, reference=chosen, scenes=part)
+            columns = tuple(
+                "minus reference" if c.startswith("minus ") else c for c in table.columns
+            )
+            rows += [
+                Row((heading, name, *row.labels, chosen), row.seeds, row.entries)
+                for row in table.rows
+            ]
+    return Table("", ("terms", "scene", "method", "reference"), columns, tuple(rows), ())
+
+
+def reference_in(group: Sequence[Cell], reference: str | None) -> str:
+    """Returns the reference if the group has it, else the last method in the order of tables."""
+    methods = methods_of(with_short_names(group))
+    return reference if reference in methods else methods[-1]
+
+
+def difference_of(
+    cells: Sequence[Cell], method: str, reference: str, metric: str = "psnr"
+) -> Estimate | None:
+    """Computes a method minus a reference over the seeds and test views that both have.
+
+    Returns None for the reference itself, and where one of the two has no values in a scene.
+    """
+    seeds, scenes = seeds_by_method(cells), scenes_of(cells)
+    if method == reference:
+        return None
+    shared = {s: {*seeds[reference][s]} & {*seeds[method][s]} for s in scenes}
+    kept = [cell for cell in cells if cell["seed"] in shared[cell["scene"]]]
+    scores = scores_by_method(kept, metric)
+    first, second = scores.get(method, {}), scores.get(reference, {})
+    if set(first) != set(scenes) or set(second) != set(scenes):
+        return None
+    return paired_difference(first, second)
+
+
+def _entry_of_difference(found: Estimate | None, metric: Metric) -> Entry:
+    if found is None:
+        return MISSING
+    text = f"{found.value:+.{metric.decimals}f}"
+    return with_bounds(Entry(found.value, text), found, metric, "+")
+
+
+def _cost(cells: Sequence[Cell], method: str, name: str, scenes: Sequence[str]) -> float | None:
+    """Returns the mean over scenes of the mean over seeds; None where a record has no value."""
+    means: list[float] = []
+    for scene in scenes:
+        own = [c for c in cells if c["scene"] == scene and method_name(c) == method]
+        values = [cell["exploration"].get(name) for cell in own]
+        if not values or None in values:
+            return None
+        means.append(float(np.mean(values)))
+    return float(np.mean(means))
 
 
 def _part(scores: Scores, scene: str | None, scenes: Sequence[str]) -> Scores:

@@ -22,7 +22,18 @@ from r3jax.apps.benchmark.plan import Request, cells_left, make_plan
 from r3jax.apps.benchmark.record import collect, read_records
 from r3jax.apps.benchmark.site import write_site
 from r3jax.apps.benchmark.submitted import plan_submission, problems_of
-from r3jax.apps.benchmark.tables import Entry, Table, headed_groups, on_equal_terms, quality_table
+from r3jax.apps.benchmark.table_formats import to_csv, to_latex, to_markdown
+from r3jax.apps.benchmark.tables import (
+    Entry,
+    Table,
+    by_scene_table,
+    comparison_table,
+    headed_groups,
+    on_equal_terms,
+    quality_table,
+    reference_in,
+    without_empty_columns,
+)
 from r3jax.cli.commands.benchmark_photos import run_photos_of
 from r3jax.cli.console import (
     Bar,
@@ -35,13 +46,16 @@ from r3jax.cli.console import (
     progress_bar,
 )
 from r3jax.cli.console import Table as ConsoleTable
-from r3jax.cli.errors import one_line
+from r3jax.cli.errors import one_line, printable
 from r3jax.cli.options.benchmark import BenchmarkOptions, parse_settings, words
 from r3jax.cli.parsing import settings_for
 from r3jax.errors import InputError
+from r3jax.evaluation.comparison import methods_of, with_short_names
 from r3jax.files import MARKER, lock_folder, own_folder, remove_own
 from r3jax.formats.submissions import Submission, read_submission
 from r3jax.interrupts import check_interrupt, settle_interrupt
+from r3jax.planning.policies import current_name
+from r3jax.runs.header import plain_settings
 
 _SHOWN = 20
 """Problems of a submission that are printed."""
@@ -64,8 +78,8 @@ def run_benchmark(options: BenchmarkOptions) -> int:
     console = Console(stderr=True)
     if options.submissions.check:
         return _check_submissions(console, options)
-    if options.page.site is not None:
-        return _write_site(console, options.out, options.page.site)
+    if options.results.site is not None:
+        return _write_site(console, options)
     if options.pool.photos:
         return run_photos_of(console, options)
     if options.machines.jobs > 0 and visible_gpus():
@@ -112,13 +126,14 @@ def _show(console: Console, options: BenchmarkOptions, cells: Sequence[Cell]) ->
     if options.submissions.submission:
         records = beside(records, read_records(options.out))
     if records:
-        print_results(Console(), records)
+        print_results(Console(), records, options.results.format, options.results.reference)
 
 
-def _write_site(console: Console, root: Path, folder: Path) -> int:
+def _write_site(console: Console, options: BenchmarkOptions) -> int:
     """Writes the page of all records."""
+    assert options.results.site is not None
     with console.status("reading the records, and rendering the worst views ..."):
-        page = write_site(root, folder)
+        page = write_site(options.out, options.results.site, options.results.reference)
     console.say(f"page     {page}")
     return 0
 
@@ -160,7 +175,9 @@ def _check_submissions(console: Console, options: BenchmarkOptions) -> int:
 def _plan(options: BenchmarkOptions, on_stage: Callable[[str], None]) -> tuple[Cell, ...]:
     """Plans the cells of the policies, or of the submissions."""
     if not options.submissions.submission:
-        return make_plan(_request(options), options.out, on_stage)
+        request = _request(options)
+        _check_reference(options.results.reference, request)
+        return make_plan(request, options.out, on_stage)
     conditions, snapshots = _judging(options), words(options.snapshots or "")
     cells: list[Cell] = []
     for path in options.submissions.submission:
@@ -185,6 +202,21 @@ def _plan(options: BenchmarkOptions, on_stage: Callable[[str], None]) -> tuple[C
                 f"with the seed {name[2]}: rename `policy.name` in one of them"
             )
     return tuple(cells)
+
+
+def _check_reference(reference: str | None, request: Request) -> None:
+    """Refuses a reference that will not be in the table, before anything is explored."""
+    if reference is None:
+        return
+    planned = [
+        {"policy": policy, "settings": plain_settings(point), "scene": scene}
+        for policy in map(current_name, request.policies)
+        for point in request.points
+        for scene in request.scenes
+    ]
+    methods = methods_of(with_short_names(planned)) if planned else []
+    if reference not in methods:
+        raise InputError(f"--reference {reference!r}: the table has {', '.join(methods)}")
 
 
 def _judging(options: BenchmarkOptions) -> Conditions:
@@ -240,6 +272,7 @@ def _request(options: BenchmarkOptions) -> Request:
         conditions=conditions,
         max_test_views=options.training.test_views or None,
         settings=parse_settings("settings", options.exploration.settings),
+        sweeps=options.sweeps,
         **vars(options.meshes),
     )
 
@@ -363,23 +396,48 @@ def _duration(seconds: float) -> str:
 _MARKS = {1: "bold", 2: "italic"}
 
 
-def print_results(console: Console, records: Sequence[dict[str, Any]]) -> None:
-    """Prints methods x metrics by scenes, every number a mean over seeds.
+def print_results(
+    console: Console,
+    records: Sequence[dict[str, Any]],
+    form: str = "terminal",
+    reference: str | None = None,
+) -> None:
+    """Prints methods x metrics by scenes, and what the methods gain and cost.
 
     Args:
         console: where to.
         records: of one benchmark, as `benchmark.record.read_records` gives them; what is not on
             equal terms, or has a name that is there already, gets a table of its own.
+        form: `terminal`, `csv`, `latex` or `markdown`.
+        reference: method that the others are compared with; see `tables.reference_in`.
     """
+    if form == "csv":
+        _print_text(console, to_csv(by_scene_table(records, reference)))
+        return
     notes: dict[str, None] = {}
     for heading, group in headed_groups(records):
-        table = quality_table(group, heading)
+        quality = quality_table(group, heading)
+        costs = without_empty_columns(
+            comparison_table(group, heading, reference=reference_in(group, reference))
+        )
+        if form != "terminal":
+            write = to_latex if form == "latex" else to_markdown
+            _print_text(console, write(replace(quality, notes=())))
+            _print_text(console, write(costs))
+            continue
         # Not as the table's own title, which is broken where the table ends.
         console.print(heading, style="italic")
-        console.print(_for_terminal(table))
-        notes |= dict.fromkeys(table.notes)
+        console.print(_for_terminal(quality))
+        console.print(_for_terminal(costs))
+        notes |= dict.fromkeys(quality.notes)
     for note in notes:
         console.print(note, style="dim")
+
+
+def _print_text(console: Console, text: str) -> None:
+    """Prints a table for other programs: no line is wrapped, control characters are shown."""
+    for line in text.splitlines():
+        console.out(printable(line))
 
 
 def _for_terminal(table: Table) -> ConsoleTable:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tyro.conf import arg
+from tyro.conf import UseAppendAction, arg
 
 from r3jax.apps.benchmark.terms import ExplorationTerms, TrainingTerms
 from r3jax.cli.options.groups import (
@@ -23,6 +23,7 @@ from r3jax.formats.errors import check_capture
 _WITH_SUBMISSION = (
     "submission", "check", "scenes", "snapshots", "out", "train_resolution", "iterations",
     "gaussians", "capacity", "test_views", "lpips", "backend", "engine", "jobs", "slurm",
+    "format", "reference",
 )  # fmt: skip
 _WITH_PHOTOS = (
     "photos", "choose", "first", "nearest", "every", "policies", "seeds", "out", "up",
@@ -51,6 +52,10 @@ class ExplorationOptions(ExplorationTerms):
 
     settings: Annotated[tuple[str, ...], arg(metavar="NAME=VALUE")] = ()
     """Settings of all policies: `num_candidates=50`, `lambda2=0.3`, `scoring.lambda1=8`, ..."""
+
+    sweep: Annotated[tuple[str, ...], UseAppendAction, arg(metavar="NAME=A,B")] = ()
+    """Try each of these values of a setting, for every policy: `--sweep lambda2=0.2,0.5,0.8`; given
+    twice, all combinations."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,12 +121,19 @@ class SubmissionOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SiteOptions:
-    """A page of the results."""
+class OutputOptions:
+    """How the results are shown."""
+
+    format: Literal["terminal", "csv", "latex", "markdown"] = "terminal"
+    """How the tables are printed: `csv` with every digit and a line for each scene."""
+
+    reference: Annotated[str | None, arg(metavar="METHOD")] = None
+    """Method that the others are compared with on the same views, as the table calls it; by default
+    the last of the table."""
 
     site: Annotated[Path | None, arg(metavar="FOLDER")] = None
     """Only write a static results page of the records in --out into this folder: tables with
-    intervals, and images of the worst views."""
+    intervals, curves, images of the worst views, and downloads."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,6 +170,7 @@ class BenchmarkOptions:
     For example
         r3jax benchmark --scenes flat,office --policies r3,random --seeds 0,1
         r3jax benchmark --budget views:60 --snapshots views:30,views:60 --jobs 2
+        r3jax benchmark --policies r3-pano --sweep lambda2=0.2,0.5,0.8 --format latex
         r3jax benchmark --submission theirs.jsonl --check
         r3jax benchmark --photos captures/lounge --choose 12 --seeds 0,1,2
     """
@@ -189,7 +202,7 @@ class BenchmarkOptions:
     meshes: Annotated[MeshOptions, arg(name="mesh files")] = field(default_factory=MeshOptions)
     machines: MachineOptions = field(default_factory=MachineOptions)
     submissions: SubmissionOptions = field(default_factory=SubmissionOptions)
-    page: SiteOptions = field(default_factory=SiteOptions)
+    results: OutputOptions = field(default_factory=OutputOptions)
     pool: Annotated[PhotoOptions, arg(name="photos")] = field(default_factory=PhotoOptions)
 
     @property
@@ -208,11 +221,21 @@ class BenchmarkOptions:
                 raise InputError(f"--seeds must lie between 0 and 2^31 - 1, got {seed}")
         return seeds
 
+    @property
+    def sweeps(self) -> dict[str, list[Any]]:
+        """The values to try, by setting.
+
+        Raises:
+            ValueError: a word that is not understood, a setting or value given twice.
+        """
+        given = parse_settings("settings", self.exploration.settings)
+        return parse_sweeps(self.exploration.sweep, given)
+
     def __post_init__(self) -> None:
         """Refuses values that are wrong before JAX is imported and a scene is opened."""
-        if self.page.site is not None:
-            refuse_others(self, "--site", "records", ("site", "out"))
-            check_folder(self.page.site)
+        if self.results.site is not None:
+            refuse_others(self, "--site", "records", ("site", "out", "reference"))
+            check_folder(self.results.site)
         if self.submissions.submission:
             refuse_others(self, "--submission", "submission", _WITH_SUBMISSION)
             if self.scenes != BenchmarkOptions.scenes and not self.scenes.startswith("mesh:"):
@@ -225,13 +248,37 @@ class BenchmarkOptions:
             check_policy_here(policy)
         for budget in (self.budget, *words(self.snapshots or "")):
             parse_budget(budget)
-        _ = self.seed_numbers
+        _ = self.seed_numbers, self.sweeps
         check_folder(self.out)
 
 
 def words(text: str) -> tuple[str, ...]:
     """Splits a text at its commas."""
     return tuple(word.strip() for word in text.split(",") if word.strip())
+
+
+def parse_sweeps(given: Iterable[str], settings: Iterable[str]) -> dict[str, list[Any]]:
+    """Reads `NAME=A,B` words of --sweep: the values to try of each setting.
+
+    Args:
+        given: the words.
+        settings: names that --settings gives a value already.
+
+    Raises:
+        ValueError: a word that is not understood, a setting given twice, a value given twice.
+    """
+    sweeps: dict[str, list[Any]] = {}
+    for word in given:
+        name, separator, text = word.partition("=")
+        values = [_value(part.strip()) for part in text.split(",") if part.strip()]
+        if not (name and separator and values):
+            raise InputError(f"--sweep takes NAME=A,B, got {word!r}")
+        if name in sweeps or name in settings:
+            raise InputError(f"--sweep {word}: {name} is given twice")
+        if len({repr(value) for value in values}) < len(values):
+            raise InputError(f"--sweep {word}: a value is given twice")
+        sweeps[name] = values
+    return sweeps
 
 
 def parse_settings(option: str, given: Iterable[str]) -> dict[str, Any]:
@@ -245,8 +292,12 @@ def parse_settings(option: str, given: Iterable[str]) -> dict[str, Any]:
         name, separator, text = word.partition("=")
         if not (name and separator):
             raise InputError(f"--{option} takes NAME=VALUE, got {word!r}")
-        try:
-            settings[name] = json.loads(text)
-        except ValueError:
-            settings[name] = text
+        settings[name] = _value(text)
     return settings
+
+
+def _value(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text

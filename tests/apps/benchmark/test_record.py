@@ -2,7 +2,7 @@
 
 import pytest
 
-from r3jax.apps.benchmark.record import read_lines, write_records
+from r3jax.apps.benchmark.record import read_records, write_records
 from tests.evaluation.records import record
 
 
@@ -10,7 +10,7 @@ def test_records_come_back_in_their_order(tmp_path):
     path = tmp_path / "records.jsonl"
     records = [record(policy, seed=seed) for policy in ("r3", "random") for seed in (2, 0)]
     write_records(path, records)
-    assert read_lines(path) == records
+    assert read_records(path) == records
 
 
 @pytest.mark.parametrize("harm", ['{"format": 1}', "no JSON", "", '{"format": 99}'])
@@ -20,7 +20,7 @@ def test_a_line_that_is_no_record_is_named(tmp_path, harm):
     first, second = path.read_text().splitlines()
     path.write_text(f"{first}\n{harm}\n{second}\n")
     with pytest.raises(ValueError, match=r"records\.jsonl, line 2, is no record of a benchmark"):
-        read_lines(path)
+        read_records(path)
 
 
 def test_no_flipped_bit_of_a_record_is_believed(tmp_path):
@@ -33,7 +33,7 @@ def test_no_flipped_bit_of_a_record_is_believed(tmp_path):
         flipped[bit // 8] ^= 1 << bit % 8
         path.write_bytes(flipped)
         try:
-            found = read_lines(path)
+            found = read_records(path)
         except ValueError:
             continue
         assert found == records  # a blank

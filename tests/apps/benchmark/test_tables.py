@@ -1,10 +1,19 @@
 """Records that may share a table, and headings that tell the tables apart."""
 
+import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r3jax.apps.benchmark.tables import groups_on_equal_terms, headed_groups, on_equal_terms
-from r3jax.evaluation.comparison import check_equal_terms
+from r3jax.apps.benchmark.tables import (
+    comparison_table,
+    groups_on_equal_terms,
+    headed_groups,
+    on_equal_terms,
+    reference_in,
+)
+from r3jax.evaluation.comparison import check_equal_terms, scores_by_method
+from r3jax.evaluation.statistics import mean_over_scenes, paired_difference
 from tests.evaluation.records import benchmark, record
 
 TRAINING = record()["training"]
@@ -73,3 +82,55 @@ def test_terms_do_not_depend_on_names():
     assert on_equal_terms(of(), of(version=1))
     assert not on_equal_terms(of(), of(clock="wall"))
     assert not on_equal_terms(of(), of() | {"scene_hash": "another"})
+
+
+def entries_of(table):
+    return {row.labels[0]: dict(zip(table.columns, row.entries, strict=True)) for row in table.rows}
+
+
+def test_a_comparison_has_means_differences_and_costs():
+    cells = benchmark(("random", "r3", "r3-pano"), views=6)
+    for cell in cells:
+        if cell["policy"] == "r3":
+            cell["exploration"] |= {"decision_ms": 10.0 + cell["seed"], "map_bytes": 3e6}
+    found = entries_of(comparison_table(cells, reference="r3"))
+    scores = scores_by_method(cells, "psnr")
+    mean = mean_over_scenes(scores["random"])
+    assert found["random"]["PSNR [dB]"].value == pytest.approx(mean.value)
+    assert found["random"]["PSNR [dB]"].extra == {"low": mean.low, "high": mean.high}
+    difference = paired_difference(scores["random"], scores["r3"])
+    assert found["random"]["minus r3"].value == pytest.approx(difference.value)
+    assert difference.value < 0.0
+    assert found["r3"]["minus r3"].value is None
+    assert found["r3"]["decision [ms]"].value == pytest.approx(11.0)
+    assert found["r3"]["map [MB]"].value == pytest.approx(3.0)
+    assert found["random"]["decision [ms]"].value is None  # records of an earlier version
+    assert found["random"]["path [m]"].value == pytest.approx(24.0)
+    poor = np.mean([np.mean(np.less(c["views"]["psnr"], 20.0)) for c in cells
+                    if c["policy"] == "random"])  # fmt: skip
+    assert found["random"]["< 20 dB [%]"].value == pytest.approx(100.0 * poor)
+
+
+def test_a_comparison_leaves_out_what_is_missing():
+    cells = benchmark(("random", "r3"), views=6)
+    cells = [c for c in cells if (c["policy"], c["scene"]) != ("random", "house")]
+    found = entries_of(comparison_table(cells))
+    assert found["random"]["PSNR [dB]"].value is None
+    assert found["random"]["minus r3"].value is None
+    alone = entries_of(comparison_table(cells, scenes=["flat"]))
+    assert alone["random"]["minus r3"].value is not None
+    fewer = [c for c in benchmark(("random", "r3"), views=6)
+             if (c["policy"], c["seed"]) != ("random", 2)]  # fmt: skip
+    shared = [c for c in fewer if c["seed"] != 2]
+    assert (
+        entries_of(comparison_table(fewer))["random"]["minus r3"]
+        == entries_of(comparison_table(shared))["random"]["minus r3"]
+    )
+
+
+def test_the_reference_is_the_last_method_unless_told():
+    cells = benchmark(("random", "r3"), views=6)
+    assert reference_in(cells, None) == reference_in(cells, "mine") == "r3"
+    assert reference_in(cells, "random") == "random"
+    with pytest.raises(ValueError, match="mine"):
+        comparison_table(cells, reference="mine")

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments.pages.distribution_figures import density, ridge_figure
+from tests.apps.benchmark.test_figures import assert_drawn
 from tests.evaluation.records import benchmark
-from tests.experiments.pages.test_benchmark_figures import assert_drawn
 
 
 @given(st.lists(st.integers(0, 40), min_size=1, max_size=30))

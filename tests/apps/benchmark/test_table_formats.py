@@ -7,7 +7,7 @@ import re
 import pytest
 
 from experiments.pages.comparison_tables import difference_table, tail_table
-from experiments.pages.table_formats import to_csv, to_latex, to_markdown
+from r3jax.apps.benchmark.table_formats import to_csv, to_latex, to_markdown
 from r3jax.apps.benchmark.tables import quality_table
 from tests.evaluation.records import benchmark
 

@@ -91,7 +91,7 @@ def styles_of(methods: Sequence[str]) -> dict[str, PolicyStyle]:
 
 
 def legend_below(figure: Figure, labels: Sequence[str]) -> None:
-    """One legend for all panels, below them; the figure grows by its height.
+    """Draws one legend for all panels, below them; the figure grows by its height.
 
     Args:
         figure: whose axes have artists with these labels.

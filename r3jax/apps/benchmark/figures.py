@@ -1,32 +1,133 @@
-"""The benchmark's curves: quality over a budget, a swept setting, and what planning costs."""
+"""Figures of a benchmark's page: quality over the budget, and the response to a swept setting."""
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullLocator
 
-from experiments.curves import EXPLORATION, snapshot_kind, values_by_seed
-from experiments.pages.policy_style import (
-    OKABE_ITO,
-    PolicyStyle,
-    legend_below,
-    styles_of,
-)
+from r3jax.apps.benchmark.policy_style import OKABE_ITO, PolicyStyle, legend_below, styles_of
 from r3jax.apps.benchmark.tables import full_title
+from r3jax.errors import InputError
 from r3jax.evaluation.comparison import (
     Cell,
     check_equal_terms,
     method_name,
     methods_of,
     scenes_of,
+    snapshots_of,
+    view_values,
     with_short_names,
 )
 from r3jax.evaluation.scores import METRICS
 from r3jax.plots import style
 
+EXPLORATION = {
+    "views": "views",
+    "seconds": "mission clock [s]",
+    "metres": "path [m]",
+    "known_share": "share of the box explored",
+    "mean_renderability": "mean renderability",
+}
+"""Quantities of a record's exploration, and their names on axes."""
+
 _PANELS_PER_LINE = 4
+
+
+def curves_of(records: Sequence[Cell]) -> list[tuple[str, list[Cell]]]:
+    """Groups records that may share curves, each with the quantity on its axis.
+
+    Groups in which no method has two snapshots have no curve, and are left out.
+    """
+    found: list[tuple[str, list[Cell]]] = []
+    for snapshot in snapshots_of(records):
+        for record in (r for r in records if r["snapshot"] == snapshot):
+            kind = snapshot.partition(":")[0]
+            for other, group in found:
+                if other == kind and _may_join(group, record):
+                    group.append(record)
+                    break
+            else:
+                found.append((kind, [record]))
+    axes = {"views": "views", "seconds": "seconds", "meters": "metres"}
+    return [(axes[kind], group) for kind, group in found if _has_curve(group)]
+
+
+def _has_curve(group: Sequence[Cell]) -> bool:
+    points = {(method_name(cell), cell["scene"], cell["snapshot"]) for cell in group}
+    return len(points) > len({point[:2] for point in points})
+
+
+def _may_join(group: Sequence[Cell], record: Cell) -> bool:
+    try:
+        check_equal_terms([*group, record], one_snapshot=False)
+    except ValueError:
+        return False
+    return True
+
+
+def response_figures(cells: Sequence[Cell]) -> dict[str, Figure]:
+    """Draws mean PSNR against each setting that varies, a line per policy and scene, by setting.
+
+    Of several settings the others lie in the band.
+
+    Args:
+        cells: on equal terms, of one snapshot.
+    """
+    short = with_short_names(cells)
+    figures: dict[str, Figure] = {}
+    for name in sorted({name for cell in short for name in cell["settings"]}):
+        scores: dict[str, dict[str, list[float]]] = {}
+        values: dict[str, object] = {}
+        for cell in short:
+            psnr = view_values(cell, "psnr")
+            if name not in cell["settings"] or psnr is None or np.isnan(psnr).all():
+                continue
+            value = cell["settings"][name]
+            values[repr(value)] = value
+            line = scores.setdefault(f"{cell['policy']}, {cell['scene']}", {})
+            line.setdefault(repr(value), []).append(float(np.nanmean(psnr)))
+        if len(values) > 1:
+            padded = {line: _padded([found.get(v, []) for v in values])
+                      for line, found in scores.items()}  # fmt: skip
+            y = "mean PSNR of the test views [dB]"
+            figures[name] = sweep_figure(name, list(values.values()), padded, y)
+    return figures
+
+
+def _padded(rows: Sequence[Sequence[float]]) -> np.ndarray:
+    width = max(map(len, rows))
+    return np.array([[*row] + [np.nan] * (width - len(row)) for row in rows])
+
+
+def snapshot_kind(cells: Sequence[Cell]) -> str:
+    """Returns what the snapshots count: views, seconds or meters.
+
+    Raises:
+        ValueError: the kinds differ; then they are no points of one curve.
+    """
+    kinds = sorted({snapshot.partition(":")[0] for snapshot in snapshots_of(cells)})
+    if len(kinds) > 1:
+        raise InputError(f"a curve has snapshots of one kind, got {' and '.join(kinds)}")
+    return kinds[0]
+
+
+def values_by_seed(cells: Sequence[Cell], quantity: str) -> np.ndarray:
+    """Returns a quantity of one method in one scene, [seeds, snapshots]; NaN where there is none.
+
+    Args:
+        cells: of one method and scene.
+        quantity: of `EXPLORATION`, or a column of the test views, then its mean.
+    """
+    seeds, snapshots = sorted({cell["seed"] for cell in cells}), snapshots_of(cells)
+    values = np.full((len(seeds), len(snapshots)), np.nan)
+    for cell in cells:
+        place = seeds.index(cell["seed"]), snapshots.index(cell["snapshot"])
+        if quantity in EXPLORATION:
+            values[place] = cell["exploration"][quantity]
+        elif (views := view_values(cell, quantity)) is not None and not np.isnan(views).all():
+            values[place] = np.nanmean(views)
+    return values
 
 
 def curve_figure(cells: Sequence[Cell], x: str = "views", y: str = "psnr") -> Figure:
@@ -51,7 +152,7 @@ def curve_figure(cells: Sequence[Cell], x: str = "views", y: str = "psnr") -> Fi
     cells = with_short_names(cells)
     scenes, styles = scenes_of(cells), styles_of(methods_of(cells))
     x_label, y_label = _label(x), _label(y)
-    figure, panels = _panels(len(scenes))
+    figure, panels = panels_of(len(scenes))
     for scene, axes in zip(scenes, panels, strict=True):
         style.dress(axes, scene, x_label, y_label)
         for method, look in styles.items():
@@ -64,7 +165,7 @@ def curve_figure(cells: Sequence[Cell], x: str = "views", y: str = "psnr") -> Fi
 def _label(quantity: str) -> str:
     titles = EXPLORATION | {metric.name: full_title(metric) for metric in METRICS}
     if quantity not in titles:
-        raise ValueError(f"no quantity {quantity!r}; there are {', '.join(titles)}")
+        raise InputError(f"no quantity {quantity!r}; there are {', '.join(titles)}")
     return titles[quantity]
 
 
@@ -107,11 +208,11 @@ def sweep_figure(
     """
     for name, found in scores.items():
         if found.ndim != 2 or len(found) != len(values):
-            raise ValueError(
+            raise InputError(
                 f"{name}: needs scores [{len(values)} values, seeds], got shape {found.shape}"
             )
     if chosen is not None and chosen not in values:
-        raise ValueError(f"{setting}={chosen} was not tried; tried were {list(values)}")
+        raise InputError(f"{setting}={chosen} was not tried; tried were {list(values)}")
     figure = style.new_figure(6.4, 3.9)
     axes = style.dress(figure.subplots(), x=setting, y=y_label)
     x, is_number = _places(values)
@@ -148,73 +249,7 @@ def _places(values: Sequence[object]) -> tuple[np.ndarray, bool]:
     return np.arange(len(values), dtype=np.float64), False
 
 
-Samples = Mapping[str, tuple[np.ndarray, np.ndarray]]
-"""Per method the numbers of key frames in the map [k], and what was measured there."""
-
-
-def latency_figure(latency: Samples, title: str = "") -> Figure:
-    """Returns milliseconds of planning against key frames: a panel per method, all on one scale.
-
-    Line: median; band: to the 95th percentile; dotted: 99th percentile.
-
-    Args:
-        latency: milliseconds [k, repeats] per method, NaN where there are fewer repeats.
-        title: above all, such as the machine.
-    """
-    styles = styles_of(list(latency))
-    figure, panels = _panels(len(latency), share=True)
-    for axes, (method, (frames, samples)) in zip(panels, latency.items(), strict=True):
-        style.dress(axes, x="key frames", y="planning [ms]").label_outer()
-        axes.set_title(method, fontsize=11, color=style.INK, loc="left", fontweight="bold", pad=16)
-        p50, p95, p99 = np.nanpercentile(samples, [50, 95, 99], axis=1)
-        color = styles[method].color
-        band = axes.fill_between(frames, p50, p95, color=color, alpha=0.2, label="to p95")
-        band.set_linewidth(0)
-        axes.plot(frames, p50, color=color, linewidth=2.0, label="p50")
-        axes.plot(frames, p99, color=color, linewidth=1.0, linestyle=":", label="p99")
-        overall = [
-            f"p{p} {value:.0f}" if value >= 100.0 else f"p{p} {value:.3g}"
-            for p, value in zip((50, 95, 99), np.nanpercentile(samples, (50, 95, 99)), strict=True)
-        ]
-        axes.annotate(
-            f"all: {', '.join(overall)} ms", (0.0, 1.0), xycoords="axes fraction", xytext=(0, 4),
-            textcoords="offset points", fontsize=8, color=style.MUTED,
-        )  # fmt: skip
-    panels[0].set_yscale("log")
-    panels[0].yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    panels[0].yaxis.set_major_formatter("{x:g}")
-    panels[0].yaxis.set_minor_locator(NullLocator())
-    legend_below(figure, ["p50", "to p95", "p99"])
-    figure.suptitle(title, fontsize=11, color=style.INK, fontweight="bold")
-    return figure
-
-
-def memory_figure(memory: Samples, title: str = "", limit: float | None = None) -> Figure:
-    """Returns bytes that planning needs against key frames: a line per method.
-
-    Args:
-        memory: bytes [k] per method.
-        title: what was measured (device memory, process memory).
-        limit: bytes that must not be passed, as a line.
-    """
-    figure = style.new_figure(6.8, 4.0)
-    axes = style.dress(figure.subplots(), title, "key frames", "memory [MB]")
-    for method, look in styles_of(list(memory)).items():
-        frames, used = memory[method]
-        every = max(1, len(frames) // 12)  # markers, not beads
-        axes.plot(frames, np.asarray(used) / 1e6, label=method, markevery=every, **look.line())
-    if limit is not None:
-        axes.axhline(limit / 1e6, color=style.INK, linewidth=1.0, linestyle="--")
-        axes.annotate(
-            f"{limit / 1e6:g} MB", (0.01, limit / 1e6), xycoords=("axes fraction", "data"),
-            xytext=(0, 3), textcoords="offset points", fontsize=8, color=style.INK,
-        )  # fmt: skip
-    axes.set_ylim(0.0, 1.08 * axes.get_ylim()[1])
-    legend_below(figure, list(memory))
-    return figure
-
-
-def _panels(count: int, *, share: bool = False) -> tuple[Figure, list[Axes]]:
+def panels_of(count: int, *, share: bool = False) -> tuple[Figure, list[Axes]]:
     """Makes a figure with this number of panels, in lines of four."""
     columns = min(count, _PANELS_PER_LINE)
     lines = -(-count // columns)

@@ -7,11 +7,8 @@ import pytest
 from PIL import Image
 from skimage.color import rgb2lab
 
-from experiments.pages.benchmark_figures import (
-    curve_figure,
-    sweep_figure,
-)
-from experiments.pages.policy_style import OKABE_ITO, styles_of
+from r3jax.apps.benchmark.figures import curve_figure, sweep_figure
+from r3jax.apps.benchmark.policy_style import OKABE_ITO, styles_of
 from r3jax.plots import style
 from tests.evaluation.records import SKILL, benchmark, record
 
@@ -106,6 +103,28 @@ def test_colors_differ_without_red_or_green():
             for i, first in enumerate(seen):
                 for second in seen[:i]:
                     assert np.linalg.norm(first - second) > 15.0  # 2.3 is just noticeable
+
+
+def test_a_sweep_draws_what_was_tried_in_order():
+    scores = {"flat": np.array([[3.0, 5.0], [1.0, 1.0], [2.0, np.nan], [np.nan, np.nan]])}
+    figure = sweep_figure("lambda1", [0.5, 0.1, 1.0, 2.0], scores, "PSNR [dB]", chosen=1.0)
+    axes = figure.axes[0]
+    np.testing.assert_allclose(lines_of(axes)["flat"], [[0.1, 0.5, 1.0], [1.0, 4.0, 2.0]])
+    assert band_of(axes)[0.5] == (3.0, 5.0)
+    assert axes.get_xscale() == "linear"
+    assert [line.get_xdata()[0] for line in axes.lines if line.get_label().startswith("_")] == [1.0]
+    assert axes.get_title(loc="right") == "chosen: lambda1 = 1.0"
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("lambda1", "PSNR [dB]")
+    assert_drawn(figure)
+    wide = sweep_figure("bins", [32, 2048], {"a": np.ones((2, 1))}, "PSNR [dB]")
+    assert wide.axes[0].get_xscale() == "log"
+
+
+def test_a_sweep_of_names_places_them_side_by_side():
+    scores = {"flat": np.array([[1.0], [2.0], [3.0]])}
+    axes = sweep_figure("form", ["max", "sum", True], scores, "SSIM").axes[0]
+    np.testing.assert_allclose(lines_of(axes)["flat"], [[0, 1, 2], [1.0, 2.0, 3.0]])
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["max", "sum", "True"]
 
 
 def test_quantities_that_cannot_stand_together_are_refused():
