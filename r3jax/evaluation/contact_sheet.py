@@ -143,12 +143,12 @@ def _draw_renderability(axes: Axes, view: SheetView) -> AxesImage:
 
 
 def _caption(row: ViewRow) -> str:
-    lines = [f"view {row.view}", f"PSNR {row.psnr:.1f} dB", f"SSIM {row.ssim:.3f}"]
+    lines = [f"frame {row.view}", f"PSNR {row.psnr:.1f} dB", f"SSIM {row.ssim:.3f}"]
     if row.lpips is not None:
         lines.append(f"LPIPS {row.lpips:.3f}")
     if row.renderability is not None:
         lines.append(f"R {row.renderability:.2f}")
-    lines.append(f"filled {100 * row.coverage:.0f} %")
+    lines.append(f"coverage {100 * row.coverage:.0f} %")
     return "\n".join(lines)
 
 

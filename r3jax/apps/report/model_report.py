@@ -175,7 +175,7 @@ def quality_rows(evaluation: dict[str, Any]) -> list[list[str]]:
             f"{low:.{digits}f} – {high:.{digits}f}",
             f"{metric['median']:.{digits}f}",
             f"{metric['percentile_5']:.{digits}f}{_TAIL.get(name, '')}",
-            f"{metric['worst']:.{digits}f} (view {metric['worst_view']})",
+            f"{metric['worst']:.{digits}f} (frame {metric['worst_view']})",
             "" if poor is None else f"{100 * poor:.0f} %",
         ])  # fmt: skip
     return rows

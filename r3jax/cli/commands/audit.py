@@ -119,7 +119,7 @@ def _show(console: Console, found: Audit, written: dict[str, Path]) -> None:
     if found.plan.views:
         console.print(_views(found))
     for what, path in written.items():
-        console.say(f"{what}  {path}")
+        console.say(f"{what:<8}  {path}")
 
 
 def _regions(found: Audit) -> Table:

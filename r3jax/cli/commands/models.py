@@ -147,7 +147,7 @@ def run_evaluate(options: EvaluateOptions) -> int:
 def _show_judgment(console: Console, judgment: Judgment, written: dict[str, Path]) -> None:
     rows, network = judgment.evaluation.rows, judgment.settings.lpips
     console.say(judgment.described)
-    console.say(f"model: {judgment.model.path}, {judgment.num_gaussians} Gaussians")
+    console.say(f"model     {judgment.model.path}, {judgment.num_gaussians} Gaussians")
     console.print(_metric_table(judgment.summaries))
     lpips = "no LPIPS" if network == "none" else f"LPIPS v0.1 with {NETWORKS[network]} on [-1, 1]"
     console.print(
@@ -164,13 +164,13 @@ def _show_judgment(console: Console, judgment: Judgment, written: dict[str, Path
         facts += f", mean renderability {np.mean(expected):.3f}"
     console.say(facts)
     for what, path in written.items():
-        console.say(f"{what}  {path}")
+        console.say(f"{what:<8}  {path}")
     for warning in warnings_of(judgment):
         console.say(f"warning: {warning}", style="yellow")
 
 
 def _metric_table(summaries: tuple[Summary, ...]) -> Table:
-    table = Table("", "mean", "", "median", "5th %", "worst (view)", "<20 dB", box=None)
+    table = Table("", "mean", "", "median", "5th %", "worst (frame)", "<20 dB", box=None)
     for column in table.columns:
         column.no_wrap = True
         column.justify = "left" if column is table.columns[0] else "right"
