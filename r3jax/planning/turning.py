@@ -1,8 +1,8 @@
-"""Where the camera looks on its way from view to view: what it can turn to in time, and what pays.
+"""Chooses viewing directions while moving: those that the camera can turn to in time, by utility.
 
 A direction is an azimuth and an elevation [rad]. A turn is as long as the straight line between two
 directions, azimuth wrapped: what a camera without roll turns through, and no less than the angle of
-the rotation. Every piece of a path allows for a turn of some size. A direction is feasible if the
+the rotation. Every piece of a path allows a turn of some size. A direction is feasible if the
 camera can turn to it on the piece before, and from it to the view at the end on the pieces after:
 no frame captured while moving makes the camera late.
 
@@ -30,24 +30,24 @@ from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.utility import visible_unexplored
 
 _SAME = 1e-6
-"""Turns that differ by no more than this are one [rad]: float32 poses are no better."""
+"""Turns that differ by less than this are equal [rad], the accuracy of float32 poses."""
 
 
 @dataclass(frozen=True)
 class Turning:
-    """How far the camera can turn on each piece of a path."""
+    """Maximum turns of the camera on each piece of a path."""
 
     start: np.ndarray
-    """Direction of the view where the path begins, [2] [rad]."""
+    """Direction of the view at the start of the path, [2] [rad]."""
 
     end: np.ndarray
     """Direction of the chosen view, [2] [rad]."""
 
     allowed: np.ndarray
-    """Largest turn on each piece, [n] [rad]; inf: any."""
+    """Maximum turn on each piece, [n] [rad]; inf: no limit."""
 
     elevations: tuple[float, float]
-    """Lowest and highest elevation of a line of sight [rad]."""
+    """Lowest and highest elevation of a viewing direction [rad]."""
 
     @property
     def is_possible(self) -> bool:
@@ -55,7 +55,7 @@ class Turning:
         return bool(turn(self.start, self.end) <= self.allowed.sum() + _SAME)
 
     def feasible(self, piece: int, now: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Finds which directions the camera may have after a piece.
+        """Finds the directions that the camera may have after a piece.
 
         Args:
             piece: number of the piece.
@@ -84,7 +84,7 @@ class Turning:
     ) -> np.ndarray:
         """Finds the feasible direction with the greatest score.
 
-        If there is none, the camera turns on towards the end.
+        If there is none, the camera turns towards the direction at the end.
 
         Args:
             piece: number of the piece.
@@ -144,8 +144,8 @@ def axes_within(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Finds the axes of a panorama that a camera may have, moved into its range of tilt.
 
-    Those whose bins, caps of 1 / B of the sphere, reach into the allowed elevations; at least those
-    that are nearest.
+    These are the axes whose bins, caps of 1 / B of the sphere, overlap the allowed elevations; at
+    least the nearest ones.
 
     Returns:
         Their numbers [m] and directions [m, 2].
@@ -161,11 +161,11 @@ def axes_within(
 def worthwhile_grid(
     grid: OccupancyGrid, places: np.ndarray, exhausted: np.ndarray | None
 ) -> OccupancyGrid:
-    """Masks the grid for frames while moving: drops cells that cannot be seen, or were given up.
+    """Excludes, for frames captured while moving, cells that cannot be seen or were given up.
 
     Args:
         grid: the grid.
-        places: of the robot, now and on its path, [n, 3] [m].
+        places: positions of the robot, now and on its path, [n, 3] [m].
         exhausted: cells that enough views failed to show, [X, Y, Z] bool; None: not known.
     """
     shape = np.array(grid.log_odds.shape)
@@ -193,9 +193,9 @@ def count_look(
     T_world_camera: Float[Array, "4 4"],
     scoring: ScoringConfig,
 ) -> Any:
-    """Counts the cells that a frame in map and grid failed to show in the policy's memory.
+    """Counts in the policy's memory the cells that a mapped frame failed to show.
 
-    What `look_round` does for the view that a decision is made from.
+    `look_round` does the same for the view before a decision.
     """
     if not isinstance(policy_state, PlannerState):
         return policy_state

@@ -1,1 +1,1 @@
-"""The robot: where it can go, how it may look, and what it could ever see."""
+"""The robot: where it can go, its allowed views, and which cells it could ever see."""

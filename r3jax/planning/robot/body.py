@@ -1,6 +1,6 @@
-"""The space that a robot, a drone or a person takes up. Its import is light: options name it, too.
+"""The space that a robot, a drone or a person takes up.
 
-`robot.room` finds where there is room for it.
+Imports nothing heavy, because command-line options use it. `robot.room` finds where it fits.
 """
 
 import math
@@ -12,35 +12,35 @@ from r3jax.errors import InputError
 
 @dataclass(frozen=True)
 class Body:
-    """What must fit where the camera goes: a footprint with a height, or a sphere.
+    """The body that must fit at the camera's positions: a footprint with a height, or a sphere.
 
     Raises:
-        ValueError: a size that no body can have.
+        ValueError: an invalid size.
     """
 
     footprint: float | tuple[tuple[float, float], ...] = 0.25
     """Radius of a disk round the vertical through the camera [m], or corners of a polygon, x ahead
-    and y to the left of it [m]. A polygon needs the room in which it can turn on the spot."""
+    and y to the left of it [m]. A polygon needs enough space to turn in place."""
 
     heights: tuple[float, float | None] | None = (0.0, None)
     """Lowest and highest part above the floor [m]; None for the highest: the camera. None for both:
     a sphere round the camera, which flies."""
 
     margin: float = 0.05
-    """Distance that is kept besides [m]; a voxel of the map is known no better."""
+    """Additional clearance [m]; voxels of the map are not more accurate."""
 
     step: float = 0.1
-    """What is no higher above the floor is driven or stepped over [m]."""
+    """Obstacles up to this height above the floor are driven or stepped over [m]."""
 
     floor: float | None = None
-    """Height of the floor at the start, world [m]; None: it is found."""
+    """Height of the floor at the start, world [m]; None: detected."""
 
     unknown_below: Literal["free", "never"] = "free"
-    """Cells below the camera of which nothing is known: `free` where the floor was seen, at them or
-    round the place where the robot stands; or `never`."""
+    """Treatment of unknown cells below the camera: `free` where the floor was seen there or around
+    the robot's position; or `never`."""
 
     def __post_init__(self) -> None:
-        """Refuses what cannot stand anywhere, and says what to do."""
+        """Refuses invalid sizes, and says what to do."""
         corners = self.footprint
         if isinstance(corners, tuple):
             flat = [float(x) for corner in corners for x in corner]
@@ -75,5 +75,5 @@ class Body:
 
     @property
     def needed(self) -> float:
-        """Least distance of the camera's vertical to what the body must not touch [m]."""
+        """Minimum distance of the camera's vertical to obstacles [m]."""
         return self.radius + self.margin

@@ -1,7 +1,7 @@
-"""The unexplored cells that count: those that the robot could ever see.
+"""Finds the unexplored cells that the robot could ever see.
 
-The inside of walls, the ground below the floor and whatever lies outside the building stay
-unexplored. A planner that counts them is drawn to them without end.
+The inside of walls, the ground below the floor and the outside of the building stay unexplored. A
+planner that counts them would be attracted by them forever.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ def explorable_cells(free: np.ndarray, unexplored: np.ndarray, reached: np.ndarr
     Args:
         free: cells known to be free, [X, Y, Z] bool.
         unexplored: cells neither free nor occupied, [X, Y, Z] bool.
-        reached: cells the robot can come to, [X, Y, Z] bool; those not free are ignored.
+        reached: cells that the robot can reach, [X, Y, Z] bool; those not free are ignored.
 
     Returns:
         The unexplored cells that count, [X, Y, Z] bool.
@@ -27,9 +27,9 @@ def explorable_cells(free: np.ndarray, unexplored: np.ndarray, reached: np.ndarr
     # Lazy import: Numba is only loaded when a path is planned.
     from r3jax.kernels.robot.cells import flood
 
-    # Free space seen through a window counts for nothing: no robot gets there to look on.
+    # Free space seen through a window does not count: the robot cannot go there.
     open_space = flood(free, reached)
-    # Grown by one cell: the two kinds of cells border on each other, and share none.
+    # Grown by one cell: the two kinds of cells are adjacent but disjoint.
     return flood(unexplored, _grown(open_space))
 
 
@@ -40,10 +40,12 @@ def mask_unexplorable(
 
     Args:
         grid: the grid.
-        reached: cells the robot can come to, [X, Y, Z] bool.
-        exhausted: cells that were looked at in vain, [X, Y, Z] bool; None: there are none.
+        reached: cells that the robot can reach, [X, Y, Z] bool.
+
+        exhausted: cells that were looked
+            at in vain, [X, Y, Z] bool; None: there are none.
     """
-    # Labels of regions are no work for XLA: their number is not known beforehand.
+    # On the host: the number of regions is not known in advance.
     free, unexplored = np.array(grid.free), np.array(grid.unexplored)
     is_hopeless = unexplored & ~explorable_cells(free, unexplored, reached)
     if exhausted is not None:

@@ -1,8 +1,8 @@
-"""A motion at a moment: which views the robot may take next, and at what cost.
+"""The limits of a motion at a pose: which views the robot may take next, and their costs.
 
-A view without roll is a position and two angles: the azimuth of its line of sight and the
-elevation above the horizon. A view that is not allowed becomes the nearest one that is: its height
-and its elevation are clipped, then the turn towards it ends early. On the host: NumPy.
+A view without roll is a position and two angles: the azimuth and the elevation of its viewing
+direction. A view that is not allowed is projected to the nearest allowed one: its height and its
+elevation are clipped, then the turn towards it is shortened. On the host: NumPy.
 
 Shape symbols: C candidates; B directions.
 """
@@ -16,27 +16,27 @@ from r3jax.planning.candidates import Candidates
 from r3jax.planning.robot.motion import MOTIONS, UNLIMITED, Motion, check_height
 
 _SAME = 1e-6
-"""Angles that differ by no more than this are one [rad]: float32 poses are no better."""
+"""Angles that differ by less than this are equal [rad], the accuracy of float32 poses."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What the robot may do next. The default allows everything."""
+    """Limits of the robot's next view. The default allows everything."""
 
     motion: Motion = MOTIONS["free"]
 
     T_world_camera: np.ndarray = field(default_factory=lambda: np.eye(4))
-    """Where it is, [4, 4], without roll."""
+    """Its current pose, [4, 4], without roll."""
 
     heights: tuple[float, float] = UNLIMITED
-    """Lowest and highest place of the camera [m], world."""
+    """Lowest and highest camera position [m], world."""
 
     def project_to_feasible(self, candidates: Candidates) -> Candidates:
-        """Projects views onto what is allowed; those that are allowed are left as they are."""
+        """Projects views to the nearest allowed ones; allowed views stay unchanged."""
         positions = self.at_height(candidates.position)
         wanted = angles_along(candidates.direction)
         allowed = self._turned(positions, *wanted)
-        # Angles and back again would round: only what must turn is turned.
+        # Converting to angles and back would round: only views that must change are converted.
         is_turned = _distance(wanted, allowed) > _SAME
         directions = np.where(is_turned[:, None], directions_along(*allowed), candidates.direction)
         return Candidates(positions, directions, candidates.valid)
@@ -44,7 +44,7 @@ class Limits:
     def at_height(self, positions: np.ndarray) -> np.ndarray:
         """Moves positions [..., 3] [m] to the nearest allowed height."""
         allowed = np.array(positions)
-        # Straight up or down is the shortest way back into a range of heights.
+        # Straight up or down is the shortest path into a range of heights.
         allowed[..., 2] = np.clip(allowed[..., 2], *self.heights)
         return allowed
 
@@ -66,10 +66,11 @@ class Limits:
     def allowed_axes(self, positions: np.ndarray, num_bins: int) -> np.ndarray:
         """Finds axes of a panorama of B bins that a view at positions [C, 3] may have, [C, B] bool.
 
-        Those whose bins, caps of 1 / B of the sphere, reach into what is allowed. At least one is
-        allowed everywhere, so that a tilt between the lattice's directions has its nearest one.
+        These are the axes whose bins, caps of 1 / B of the sphere, overlap the allowed directions.
+        At least one is allowed at each position, so that a tilt between the lattice's directions
+        has a nearest axis.
         """
-        if self.motion.looks_anywhere:  # a search of paths asks often: 3 ms for six positions
+        if self.motion.looks_anywhere:  # the rest takes 3 ms for six positions
             return np.ones((len(positions), num_bins), dtype=bool)
         nearness = self.nearness(positions[:, None, :], fibonacci_lattice(num_bins))
         # The cosine of half the opening of a cap that covers 1 / B of the sphere.
@@ -81,7 +82,7 @@ class Limits:
 
         Shapes are those of `nearness`, the result is bool.
         """
-        # The elevation is clipped first: a tilt that stops short is no turn cut short.
+        # The elevation is clipped first: a clipped tilt does not shorten the turn.
         azimuth, elevation = self.clipped(*angles_along(directions))
         turned = self._turned(positions, azimuth, elevation)
         return _distance((azimuth, elevation), turned) <= _SAME
@@ -91,10 +92,11 @@ class Limits:
 
         Args:
             lengths: of the paths.
-            directions: lines of sight at their ends, [C, 3].
+
+            directions: viewing directions at their ends, [C, 3].
 
         Returns:
-            Meters, [C]: a turn costs what could be gone meanwhile.
+            Costs [m], [C]: a turn costs the length that the robot could move in the same time.
         """
         if self.motion.speed is None or self.motion.turn_rate is None:
             return lengths
@@ -129,14 +131,14 @@ class Limits:
         if self.motion.turn_per_meter is None:
             return azimuth, elevation
         (azimuth_now,), (elevation_now,) = angles_of(self.T_world_camera[None])
-        # The straight line, not the path: who walks round a table may turn no more for it.
+        # The straight line, not the path: a detour does not allow a larger turn.
         straight = np.linalg.norm(positions - self.T_world_camera[:3, 3], axis=-1)
         allowed = np.radians(self.motion.turn_per_meter) * straight
         by = wrapped(azimuth - azimuth_now), elevation - elevation_now
         angle = _angle_of_turn(*by)
-        # No turn at all has no direction: the share of it must not be 0 / 0.
+        # Without a turn there is no direction: avoid 0 / 0.
         whole = np.maximum(np.hypot(*by), _SAME)
-        # Both angles in proportion: the view stays on the line towards the one that was wanted.
+        # Both angles in proportion: the view is on the line towards the requested one.
         share = np.where(angle <= allowed + _SAME, 1.0, np.minimum(allowed / whole, 1.0))
         return azimuth_now + share * by[0], elevation_now + share * by[1]
 
@@ -146,7 +148,7 @@ class Limits:
 
 
 UNBOUND = Limits()
-"""Limits of a robot that may do anything."""
+"""Limits of a robot without constraints."""
 
 
 def begin_at(motion: Motion, T_world_camera: np.ndarray) -> np.ndarray:
@@ -160,7 +162,7 @@ def begin_at(motion: Motion, T_world_camera: np.ndarray) -> np.ndarray:
     check_height(height, (low, high))
     pose = np.array(T_world_camera, dtype=np.float64)
     wanted = angles_of(pose[None])
-    # The elevation alone: there is no earlier pose, so that no turn can be too long.
+    # Only the elevation: without an earlier pose there is no turn.
     allowed = Limits(motion, pose).clipped(*wanted)
     if _distance(wanted, allowed)[0] > _SAME:
         pose[:3, :3] = rotations(*allowed)[0]
@@ -170,7 +172,8 @@ def begin_at(motion: Motion, T_world_camera: np.ndarray) -> np.ndarray:
 def angles_of(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Computes azimuth and elevation [rad] of poses [C, 4, 4] without roll, [C] each.
 
-    The azimuth is read off the level axis of the image: it means something straight up, too.
+    The azimuth is computed from the image's level axis, so that it is also defined for views
+    straight up.
     """
     azimuth = np.arctan2(poses[:, 0, 0], -poses[:, 1, 0])
     forward = poses[:, :3, 2]
@@ -181,7 +184,7 @@ def angles_along(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Computes azimuth and elevation [rad] of the poses along directions [..., 3], [...] each."""
     x, y, z = np.moveaxis(directions, -1, 0)
     level = np.hypot(x, y)
-    # As `pose_along` has it: the image's level axis is the world's x axis then.
+    # As in `pose_along`: the image's level axis is then the world's x axis.
     azimuth = np.where(level < 1e-6, 0.5 * np.pi, np.arctan2(y, x))
     return azimuth, np.arctan2(z, level)
 
@@ -193,7 +196,7 @@ def directions_along(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
 
 
 def rotations(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
-    """Computes the axes of cameras without roll that look there, [C, 3, 3]."""
+    """Computes the rotations of cameras without roll along these angles, [C, 3, 3]."""
     forward = directions_along(azimuth, elevation)
     # From the azimuth: a cross product with the vertical vanishes straight up and down.
     right = np.stack([np.sin(azimuth), -np.cos(azimuth), np.zeros_like(azimuth)], axis=-1)
@@ -203,8 +206,8 @@ def rotations(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
 def _angle_of_turn(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
     """Computes the angle of a rotation from its change of azimuth and elevation [rad].
 
-    The real part of the product of the two rotations' quaternions: their axes are at right angles
-    to each other, so that nothing else enters it.
+    The real part of the product of the two rotations' quaternions: their axes are perpendicular, so
+    that the other terms vanish.
     """
     cosine = np.cos(0.5 * azimuth) * np.cos(0.5 * elevation)
     return 2.0 * np.arccos(np.clip(cosine, -1.0, 1.0))

@@ -1,7 +1,7 @@
 """The robot: its body, height, limits of turning, and speed.
 
-Constraints are data: they change which candidates there are and what paths cost, and nothing else.
-`Limits` is a motion at a moment; every policy's candidates pass through it.
+Constraints only change the candidates and the costs of paths. `Limits` are those of a motion at a
+pose; every policy's candidates pass through them.
 """
 
 import math
@@ -13,10 +13,10 @@ from r3jax.planning.robot.body import Body
 from r3jax.validation.errors import did_you_mean
 
 UNLIMITED = (-math.inf, math.inf)
-"""Heights of a robot that may be at any [m]."""
+"""Heights of a robot without a limit [m]."""
 
 LEAST_RATE = 1e-3
-"""Least speed [m/s], turn rate [deg/s] and turn per meter [deg/m]: what is slower stands still, and
+"""Minimum speed [m/s], turn rate [deg/s] and turn per meter [deg/m]; smaller values would make
 flight times overflow."""
 
 _LEVEL = 90.0
@@ -36,42 +36,43 @@ def _range(values: tuple[float, float]) -> str:
 
 @dataclass(frozen=True)
 class Motion:
-    """What a robot or a person can do with the camera. The default is a free-flying camera.
+    """The motion of a robot or a person with a camera. The default is a free-flying camera.
 
     Raises:
-        ValueError: a setting that nothing could move with.
+        ValueError: an invalid setting.
     """
 
     heights: tuple[float, float] | None = None
-    """Lowest and highest place of the camera [m]; None: any."""
+    """Lowest and highest camera position [m]; None: any."""
 
     heights_above: Literal["start", "world"] = "start"
-    """What `heights` count from: where the camera starts, or the world's z = 0."""
+    """Origin of `heights`: the camera's start, or the world's z = 0."""
 
     elevations: tuple[float, float] = (-_LEVEL, _LEVEL)
-    """Lowest and highest angle of the line of sight above the horizon [deg]. A camera that can
-    only turn round the vertical has one angle, the tilt of its mounting."""
+    """Lowest and highest elevation of the viewing direction [deg]. A camera that only turns around
+    the vertical has a single elevation, the tilt of its mounting."""
 
     body: float | Body = 0.0
-    """What must fit where the camera goes. A number is the form of earlier versions: a ball of the
-    planner's `safety_margin`, all of it known free, and below it a cylinder that reaches so far
-    down [m], in which nothing may be known to be occupied."""
+    """The body that must fit at the camera's positions. A number is the form of earlier versions: a
+    ball with radius `safety_margin`, which must be known to be free, and below it a cylinder of
+    this length [m], in which nothing may be known to be occupied."""
 
     speed: float | None = None
-    """Along the path [m/s]; None: that of the loop's own settings, and turning takes no time."""
+    """Speed along the path [m/s]; None: that of the loop's settings, and turning takes no time."""
 
     turn_rate: float | None = None
-    """How fast the line of sight turns [deg/s], after the way; None: in no time."""
+    """Speed of turning at the end of the path [deg/s]; None: turning takes no time."""
 
     turn_per_meter: float | None = None
-    """Largest turn from one view to the next for each meter between them, in a straight line
-    [deg/m]: who turns on the spot blurs the images. None: any turn, anywhere."""
+    """Maximum turn per meter of straight distance between two views [deg/m], as turning in place
+    blurs images. None: no limit."""
 
     fixed_camera: bool = False
-    """Whether the camera turns only with the robot: frames while moving look along the path."""
+    """True if the camera is fixed to the robot: frames captured while moving look along the
+    path."""
 
     def __post_init__(self) -> None:
-        """Refuses what cannot work, and says what to do."""
+        """Refuses invalid settings, and says what to do."""
         if self.heights is not None:
             _check_range("heights", self.heights, "[m]")
             if self.heights_above not in ("start", "world"):
@@ -103,7 +104,7 @@ class Motion:
 
     @property
     def looks_anywhere(self) -> bool:
-        """True if the line of sight may have any direction, whatever it was before."""
+        """True if any viewing direction is allowed, independent of the previous one."""
         return self.elevations == (-_LEVEL, _LEVEL) and self.turn_per_meter is None
 
     @property
@@ -144,15 +145,15 @@ MOTIONS = {
         turn_per_meter=90.0, fixed_camera=True,
     ),
 }  # fmt: skip
-"""Motions by name: a free-flying camera; a robot on wheels whose camera is level and stays at the
-height where it starts; a drone whose gimbal cannot look up far; a person who walks."""
+"""Presets by name: a free-flying camera; a wheeled robot with a level camera at its initial height;
+a drone whose gimbal cannot look far up; a person."""
 
 
 def make_motion(name: str = "free", **changes: Any) -> Motion:
     """Makes a motion by name, with other values for some of its fields.
 
     Raises:
-        ValueError: no motion has that name, it has no such field, or a value cannot work.
+        ValueError: an unknown name or field, or an invalid value.
     """
     if name not in MOTIONS:
         hint = did_you_mean(name, MOTIONS)
@@ -165,13 +166,13 @@ def make_motion(name: str = "free", **changes: Any) -> Motion:
 
 
 def check_height(height: float, heights: tuple[float, float]) -> None:
-    """Refuses a camera at a height [m] that its robot cannot be at.
+    """Refuses a camera at a height [m] outside its robot's range.
 
     Raises:
         ValueError: says what to do.
     """
     low, high = heights
-    # A millimeter of grace: the pose may have been rounded to float32.
+    # A tolerance of a millimeter: the pose may have been rounded to float32.
     if not low - 1e-3 <= height <= high + 1e-3:
         raise InputError(
             f"the camera is at a height of {height:.3f} m, but its motion's heights are {low:.3f} "
@@ -183,11 +184,11 @@ def motion_of_record(record: Any) -> Motion:
     """Reads a motion from a JSON object; None, from old records, means a free camera.
 
     Raises:
-        ValueError: an unknown field, a value of another kind, or one that cannot work.
+        ValueError: an unknown field, a value of another type, or an invalid one.
     """
     if not isinstance(record, dict | None):
         raise InputError(f"a motion must be an object with its settings, got {record!r}")
-    # JSON has no tuples, and a list never equals one: `looks_anywhere` would be wrong.
+    # JSON has no tuples, and a list never equals a tuple.
     plain = _with_tuples(record or {})
     if isinstance(plain.get("body"), dict):
         plain["body"] = Body(**plain["body"])
@@ -201,5 +202,5 @@ def _with_tuples(value: Any) -> Any:
 
 
 def motion_of(policy: object) -> Motion:
-    """Returns the motion that a policy plans for: a free-flying camera if it does not say."""
+    """Returns the motion of a policy's settings; a free-flying camera if they have none."""
     return getattr(getattr(policy, "config", None), "motion", MOTIONS["free"])

@@ -1,18 +1,16 @@
-"""Where there is room for a body: a plan of the place for a robot, a drone or a person.
+"""Finds where a body fits: a floor plan for a robot, a drone or a person.
 
 A *sphere* round a flying camera must touch known free cells only (`travel.safe_cells`). A
-*footprint* stands on the floor and reaches up to some height; for it `room_for` draws a plan of the
-place, seen from above, as Nav2's obstacle layer does, and measures in it how far each place is from
-everything that the body must not touch:
+*footprint* stands on the floor and reaches up to some height; for it `room_for` makes a plan from
+above, like Nav2's obstacle layer, and computes the distance of each point to all obstacles:
 
-- voxels of the map between a step above the floor and the top of the body. The floor itself is
-  found from the robot on outwards, so that ramps and a noisy floor are no obstacles;
+- voxels of the map between a step above the floor and the top of the body. The floor is traced
+  outwards from the robot, so that ramps and a noisy floor are not obstacles;
 - occupied cells of the grid in which the map has no voxel (thin things, whose pixels lie on edges);
 - keep-out zones and the obstacles of a costmap (`OccupancyGrid.closed`);
-- columns of cells that are not known. A cell counts as known whether it is free or occupied:
-  what in it is an obstacle, the voxels say. Where the robot has stood is known.
-
-Cells below the camera that it cannot see count as `unknown_below` says.
+- columns of cells that are not known. Free and occupied cells both count as known: obstacles in
+  them are given by the voxels. Cells where the robot has been are known. Cells below the camera
+  that it cannot see are treated according to `unknown_below`.
 
 On the host: NumPy and SciPy. Shape symbols: X Y Z cells; x y pixels of the plan; n points.
 """
@@ -30,31 +28,31 @@ from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.planning.robot.body import Body
 
 PIXELS_PER_CELL = 4
-"""Pixels of the plan along the edge of a cell: 5 cm."""
+"""Pixels of the plan per cell and axis; a pixel is 5 cm wide."""
 
 _FLOOR_WITHIN = 3.0
-"""The floor is looked for this far round the robot [m]."""
+"""The floor is searched for up to this distance from the robot [m]."""
 
 _FLOOR_SHARE = 0.25
 """The floor is the lowest level with this share of the voxels of the fullest one."""
 
 _MAX_BLIND = 2.0
-"""However little a camera sees of the floor, unseen floor is no freer than this far from where the
-robot has been [m]."""
+"""Unseen floor counts as free only up to this distance from the robot's path [m], even for cameras
+that see little of the floor."""
 
 _LEAVING = 0.3
-"""Within this distance of the robot the margin is not needed [m]: it stands there already."""
+"""Within this distance of the robot the margin is not required [m], as it is there already."""
 
 _OVERLAP = 0.25
-"""A layer of which the body takes less than this share of a cell need not be known [cells]."""
+"""Layers of which the body takes less than this share of a cell need not be known [cells]."""
 
 
 @dataclass(frozen=True)
 class Room:
-    """A plan of the place for one body. Made by `room_for`."""
+    """The plan for one body. Made by `room_for`."""
 
     distance: np.ndarray
-    """From each pixel's center to the nearest that the body must not touch [m], [x, y]."""
+    """Distance of each pixel's center to the nearest obstacle [m], [x, y]."""
 
     origin: np.ndarray
     """Lower corner of pixel (0, 0) [m], [2]."""
@@ -63,13 +61,13 @@ class Room:
     """Side of a pixel [m]."""
 
     needed: float
-    """Least distance of the body's middle [m]."""
+    """Minimum distance of the body's center [m]."""
 
     stop: np.ndarray
-    """Flat index of the pixel where the robot stops in each column, [X, Y]; -1: nowhere."""
+    """Flat index of the stop pixel in each column, [X, Y]; -1: none."""
 
     cost: np.ndarray
-    """Length of the shortest path to each of these [m], [X, Y]; inf: there is none."""
+    """Length of the shortest path to each of these [m], [X, Y]; inf: no path."""
 
     previous: np.ndarray
     """Flat index of the pixel before each on that path, [x * y]; -1 at its start."""
@@ -78,7 +76,7 @@ class Room:
     """Height of the floor [m], [X, Y]."""
 
     counts: dict[str, int] = field(default_factory=dict[str, int])
-    """Columns round the robot, by what closes them."""
+    """Numbers of columns around the robot, by the reason why they are closed."""
 
     @property
     def columns(self) -> np.ndarray:
@@ -109,7 +107,7 @@ class Room:
         gap = ends[:, :2] - start[:2]
         if not len(gap):
             return np.zeros(0, bool)
-        # The start itself is not asked: the robot stands there.
+        # The start is not checked: the robot is there.
         num = max(int(np.ceil(np.linalg.norm(gap, axis=1).max() / (0.5 * self.pixel))), 1)
         shares = np.arange(1, num + 1) / num
         return np.asarray(self.fits(start[:2] + shares[:, None, None] * gap).all(axis=0))
@@ -124,16 +122,17 @@ def room_for(
     camera: Camera | None = None,
     trail: np.ndarray | None = None,
 ) -> Room:
-    """Draws the plan in which a body with a footprint moves.
+    """Makes the plan for a body with a footprint.
 
     Args:
-        body: its `heights` are not None.
-        grid: what is known.
+        body: a body whose `heights` are not None.
+        grid: the grid.
         voxels: centers of the map's voxels, [n, 3] [m].
         voxel_size: edge of a voxel [m].
-        T_world_camera: where the camera is, [4, 4].
-        camera: its lens, which tells how near it sees the floor; None: it does not.
-        trail: cells that the robot has come through, [X, Y, Z] bool.
+        T_world_camera: pose of the camera, [4, 4].
+        camera: its intrinsics, which give the nearest visible floor; None: it does not see the
+            floor.
+        trail: cells that the robot has passed, [X, Y, Z] bool.
     """
     known = _Known.of(body, grid, voxels, voxel_size, T_world_camera, trail)
     blind = _blind_radius(camera, T_world_camera, known.height)
@@ -145,7 +144,7 @@ def room_for(
     low, position = known.origin, known.position
     x, y = (low[i] + pixel * (np.arange(closed.shape[i]) + 0.5) - position[i] for i in range(2))
     own = np.hypot(x[:, None], y[None, :])
-    # Where the robot stands is known, whatever the cells say.
+    # The robot's own position counts as known.
     closed &= own > body.needed + pixel
     if grid.closed is not None:
         zones = grid.closed.any(axis=2)
@@ -153,7 +152,7 @@ def room_for(
     hit = np.floor((known.obstacles[:, :2] - low[:2]) / pixel).astype(np.int64)
     obstacles = np.zeros_like(closed)
     obstacles[tuple(np.clip(hit, 0, np.array(closed.shape) - 1).T)] = True
-    # The robot is not inside of anything: what seems to be there is itself, or noise.
+    # The robot is not inside of an obstacle: voxels there are itself, or noise.
     obstacles &= own > body.radius
     # Beyond the grid nothing is known.
     blocked = np.pad(closed | obstacles, 1, constant_values=True)
@@ -174,7 +173,7 @@ def room_for(
 
 @dataclass(frozen=True)
 class _Known:
-    """What is known of the cells that a body would take up."""
+    """Known cells and voxels in the range of heights of a body."""
 
     body: Body
     free: np.ndarray
@@ -186,12 +185,12 @@ class _Known:
     above: np.ndarray
     """Their heights above the floor of their columns, [n] [m]."""
     cells: np.ndarray
-    """The cells that hold them, [n, 3]."""
+    """Their cells, [n, 3]."""
     voxel_size: float
     position: np.ndarray
-    """The camera's, [3] [m]."""
+    """Position of the camera, [3] [m]."""
     height: float
-    """Of the camera above the floor [m]."""
+    """Height of the camera above the floor [m]."""
     floor: np.ndarray
     """Height of the floor, [X, Y] [m]."""
     within: np.ndarray
@@ -201,19 +200,19 @@ class _Known:
     top: np.ndarray
     """Highest part, world, [X, Y] [m]."""
     been: np.ndarray
-    """Columns that the robot has come through, its own included, [X, Y] bool."""
+    """Columns that the robot has passed, including its own, [X, Y] bool."""
 
     @classmethod
     def of(
         cls, body: Body, grid: OccupancyGrid, voxels: np.ndarray, voxel_size: float,
         T_world_camera: np.ndarray, trail: np.ndarray | None,
     ) -> "_Known":  # fmt: skip
-        """Finds the floor, and from it on which cells the body takes up."""
+        """Finds the floor, and the cells that the body would take up above it."""
         assert body.heights is not None
         size, origin = float(grid.cell_size), np.asarray(grid.origin, np.float64)
         free, occupied = np.asarray(grid.free), np.asarray(grid.occupied)
         shape, position = free.shape, np.asarray(T_world_camera, np.float64)[:3, 3]
-        # What is higher than any body can be no obstacle, and no floor.
+        # Voxels above the body are neither obstacles nor floor.
         tallest = position[2] + (body.heights[1] or 0.0) + size
         voxels = voxels[voxels[:, 2] < tallest]
         cells = np.floor((voxels - origin) / size).astype(np.int64)
@@ -228,7 +227,7 @@ class _Known:
         bottom, top = floor + low, floor + max(high, low + 0.5 * voxel_size)
         lower = origin[2] + size * np.arange(shape[2])
         overlap = np.minimum(lower + size, top[..., None]) - np.maximum(lower, bottom[..., None])
-        # At least one layer counts, however thin the body is.
+        # At least one layer counts, even for thin bodies.
         thickest = overlap.max(axis=2, keepdims=True)
         within = overlap > np.minimum(_OVERLAP * size, 0.99 * thickest)
         been = np.zeros(shape[:2], bool)
@@ -245,7 +244,7 @@ class _Known:
     def obstacles(self) -> np.ndarray:
         """Centers of voxels that the body would touch, [n, 3] [m]."""
         top = self.top[self.cells[:, 0], self.cells[:, 1]]
-        # A tenth of a voxel of grace: the floor itself is known no better.
+        # A tolerance of a tenth of a voxel, the accuracy of the floor.
         is_above = self.above > self.low + 0.1 * self.voxel_size
         return self.voxels[is_above & (self.voxels[:, 2] - 0.5 * self.voxel_size < top)]
 
@@ -262,14 +261,14 @@ class _Known:
         return found
 
     def thin_obstacles(self) -> np.ndarray:
-        """Finds columns with an occupied cell above the floor that no voxel explains, [X, Y]."""
+        """Finds columns with an occupied cell above the floor but without a voxel in it, [X, Y]."""
         lower = self.origin[2] + self.size * np.arange(self.free.shape[2])
         floor, step = self.floor[..., None], self.body.step
         holds_floor = (lower < floor + step) & (lower + self.size > floor - step)
         return (self.within & self.occupied & ~self.has_voxel & ~holds_floor).any(axis=2)
 
     def columns(self, blind: float, thin: np.ndarray) -> np.ndarray:
-        """Finds columns of which enough is known for the body to stand in them, [X, Y] bool."""
+        """Finds columns in which enough cells are known for the body, [X, Y] bool."""
         known = (self.free | self.occupied | self.has_voxel | ~self.within).all(axis=2)
         radius = self.body.needed / self.size
         known |= _dilated(self.been, radius)
@@ -284,7 +283,8 @@ class _Known:
         hit = np.zeros(known.shape, bool)
         tall = self.cells[self.above > self.body.step + self.voxel_size]
         hit[tall[:, 0], tall[:, 1]] = True
-        # Round obstacles, not through them: what hides behind a table is not the blind spot.
+        # Around obstacles, not through them: the space behind a table is not the camera's blind
+        # spot.
         near, square = _dilated(self.been, radius), np.ones((3, 3), bool)
         for i in range(int(np.ceil(blind / self.size / 0.85))):
             near = np.asarray(ndimage.binary_dilation(near, None if i % 2 else square, mask=~hit))
@@ -298,13 +298,13 @@ class _Known:
 def _search(
     distance: np.ndarray, own: np.ndarray, pixel: float, num: int, body: Body
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Searches shortest paths over the plan, and the roomiest reachable pixel of each column.
+    """Searches shortest paths over the plan, and the pixel with most clearance in each column.
 
     Returns:
         The pixel's flat index and the length of the path to it [m], [X, Y] each; and the flat index
         of the pixel before each pixel, [x * y].
     """
-    # Where it stands the robot fits, and it may leave the margin of what has come near.
+    # The robot fits at its position, and may leave the margin of obstacles that have come near.
     usable = (distance >= body.needed) | ((own < _LEAVING) & (distance >= body.radius))
     start = np.unravel_index(np.argmin(own), own.shape)
     is_inside = own[start] < pixel
@@ -315,7 +315,7 @@ def _search(
     x, y = distance.shape[0] // num, distance.shape[1] // num
     by_cell = lambda a: a.reshape(x, num, y, num).transpose(0, 2, 1, 3).reshape(x, y, num * num)
     fits = np.where(distance >= body.needed, distance, -np.inf)
-    # Of those that can be reached, if there are any.
+    # Among reachable pixels, if there are any.
     best = np.argmax(by_cell(np.where(np.isfinite(cost), fits + 1e3, fits)), axis=2)[..., None]
     pick = lambda a: np.take_along_axis(by_cell(a), best, axis=2)[..., 0]
     stop = np.where(pick(fits) > 0.0, pick(np.arange(cost.size).reshape(cost.shape)), -1)
@@ -330,7 +330,7 @@ def _floor_at(
     body: Body, voxels: np.ndarray, voxel_size: float, occupied: np.ndarray,
     origin: np.ndarray, size: float, position: np.ndarray,
 ) -> float:  # fmt: skip
-    """Finds the height of the floor under the robot [m]: given, seen, or the box's lower bound."""
+    """Returns the floor's height under the robot [m]: given, detected, or the box's lower bound."""
     if body.floor is not None:
         return body.floor
     gap = np.linalg.norm(voxels[:, :2] - position[:2], axis=1)
@@ -360,7 +360,7 @@ def _floor_map(
     low = np.floor(origin[2] / voxel_size)
     num = int(np.ceil(shape[2] * size / voxel_size)) + 2
     level = np.clip(np.floor(voxels[:, 2] / voxel_size) - low, 0, num - 1).astype(np.int64)
-    # How many, not whether any: a stray voxel of noise must not lift the floor.
+    # Their number counts: a single outlier must not raise the floor.
     filled = np.zeros((*shape[:2], num))
     np.add.at(filled, (cells[:, 0], cells[:, 1], level), 1.0)
     heights = (low + np.arange(num) + 0.5) * voxel_size
@@ -399,7 +399,7 @@ def _dilated(mask: np.ndarray, radius: float) -> np.ndarray:
 
 
 def _blind_radius(camera: Camera | None, T_world_camera: np.ndarray, height: float) -> float:
-    """Computes how far from the robot the image first shows the floor [m]; 0: it never does."""
+    """Computes the smallest distance at which the image shows the floor [m]; 0: never."""
     if camera is None:
         return 0.0
     T = np.asarray(T_world_camera, np.float64)

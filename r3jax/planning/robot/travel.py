@@ -1,12 +1,12 @@
-"""Path lengths and waypoints over known free space. On the host: NumPy and Numba.
+"""Path lengths and waypoints through known free space. On the host: NumPy and Numba.
 
 A cell is *safe* if the ball of the safety margin round its center touches known free cells only;
 unknown space is an obstacle. With 0.2 m cells and 0.3 m margin these are the cells whose 26
-neighbors are free, so that every point of a path keeps at least one cell's width from
-anything that is not known to be free. The cell in which the robot stands is always usable.
+neighbors are free, so that every point of a path keeps at least one cell's width from anything that
+is not known to be free. The robot's own cell is always usable.
 
 For a robot with a footprint (`body.Body`) a cell is safe if the footprint fits somewhere in it, by
-the plan that `room.room_for` draws. Paths are searched for and straight lines checked on that plan.
+the plan that `room.room_for` draws. Paths and straight lines are then checked on that plan.
 
 Paths run over the 26-connected graph of usable cells. A diagonal step needs every cell of the
 block it crosses, so that it cannot squeeze between two corners. `skimage.graph.MCP_Geometric`
@@ -29,17 +29,17 @@ from r3jax.planning.robot.motion import UNLIMITED, check_height
 from r3jax.planning.robot.room import Room
 
 _INSET = 1e-2
-"""A camera at a fixed height that is a border of layers counts as so far inside its own [cells]:
-the next layer is none of its cells."""
+"""A camera at a fixed height on the border of layers is moved by this distance into its own layer
+[cells], so that the next layer does not count."""
 
 _TOUCH = 1e-3
-"""A height this close to a border of layers is on the upper one's side, and a body this close to
-matter touches it [cells]."""
+"""Tolerance [cells]: a height this close to a border of layers belongs to the upper layer, and a
+body this close to a surface touches it."""
 
 
 @dataclass(frozen=True)
 class Travel:
-    """What can be reached from one position, how far it is, and the way. Made by `plan_travel`."""
+    """Reachable space from one position, with path lengths and paths. Made by `plan_travel`."""
 
     start: np.ndarray
     """The robot's position, [3] float64 [m]."""
@@ -57,10 +57,10 @@ class Travel:
     """Cells known to be free, [X, Y, Z] bool."""
 
     safe: np.ndarray
-    """Cells that keep the margin and are open to the robot, [X, Y, Z] bool."""
+    """Cells that keep the margin and in which the robot may be, [X, Y, Z] bool."""
 
     usable: np.ndarray
-    """Cells that paths may cross: the safe ones, the robot's own, [X, Y, Z] bool."""
+    """Cells that paths may cross: safe cells and the robot's own, [X, Y, Z] bool."""
 
     cost: np.ndarray
     """Length of the shortest way between the centers of the robot's cell and of each cell [m],
@@ -100,7 +100,7 @@ class Travel:
 
     def cell_of(self, position: np.ndarray) -> tuple[int, int, int]:
         """Finds the cell that holds a position [m]; it may lie outside the grid."""
-        # float64 throughout: float32 would put points on a border into either cell.
+        # float64 throughout: in float32 points on a border could be in either cell.
         x, y, z = np.floor((np.asarray(position, np.float64) - self.origin) / self.cell_size)
         return int(x), int(y), int(z)
 
@@ -109,15 +109,12 @@ class Travel:
         return self.origin + (np.asarray(cells) + 0.5) * self.cell_size
 
     def stops(self, cells: np.ndarray) -> np.ndarray:
-        """Computes where the camera stands in cells given by index, [n, 3] [m].
-
-        It stands at an allowed height.
-        """
+        """Computes the stop positions in cells given by index, [n, 3] [m], at allowed heights."""
         places = self.centers(cells)
         if self.room is not None:
             x, y = np.moveaxis(np.asarray(cells)[..., :2], -1, 0)
             stop = self.room.stop[x, y]
-            # Pixel 0 stands in where there is no stop, and is not used.
+            # Pixel 0 replaces missing stops, and is not used.
             middles = self.room.places(np.asarray(np.maximum(stop, 0)))
             places[..., :2] = np.where((stop >= 0)[..., None], middles, places[..., :2])
         places[..., 2] = np.clip(places[..., 2], *self.heights)
@@ -135,19 +132,19 @@ class Travel:
         return float(np.linalg.norm(first - self.start) + self.cost[x, y, z])
 
     def lengths(self, positions: np.ndarray) -> np.ndarray:
-        """Computes path lengths [m] to positions [n, 3]; inf where there is no path.
+        """Computes path lengths [m] to positions [n, 3]; inf without a path.
 
-        The straight line where it is safe, else the path over the cells' centers: no shorter
-        than what `path` returns.
+        The straight line if it is safe, else the path over the cells' centers, an upper bound of
+        the length of `path`.
         """
         cells = np.floor((positions - self.origin) / self.cell_size).astype(np.int64)
         is_inside = np.all((cells >= 0) & (cells < self.usable.shape), axis=1)
-        # Cell 0 stands in for those outside: a negative index would read from the far side.
+        # Positions outside use cell 0: a negative index would read from the far side.
         cells = np.where(is_inside[:, None], cells, 0)
         x, y, z = cells.T
         from_start = np.linalg.norm(self.stops(np.array(self.start_cell)) - self.start)
         if self.room is not None:
-            from_start = 0.0  # the search began at the robot, not in the middle of its cell
+            from_start = 0.0  # the search began at the robot, not at the center of its cell
         last = np.linalg.norm(positions - self.stops(cells), axis=1)
         lengths = np.where(is_inside, from_start + self.cost[x, y, z] + last, np.inf)
         if self.room is not None:
@@ -156,9 +153,9 @@ class Travel:
             for i in np.flatnonzero(np.isfinite(lengths)):
                 if not self.room.fits_along(stops[i], positions[i : i + 1])[0]:
                     lengths[i] = np.inf
-            # Turning on the spot is no path.
+            # Turning in place has no path.
             lengths[np.linalg.norm(positions - self.start, axis=1) < 1e-6] = 0.0
-        # The straight line where it is safe: no way is shorter, and `path` takes it too.
+        # The straight line if it is safe: the shortest path, which `path` also takes.
         near = np.flatnonzero(np.isfinite(lengths))
         straight = near[self.in_reach(self.start, positions[near])]
         lengths[straight] = np.linalg.norm(positions[straight] - self.start, axis=1)
@@ -168,7 +165,7 @@ class Travel:
         """Plans waypoints [K, 3] [m] from the robot to a position; all of the path is safe.
 
         Raises:
-            ValueError: there is no way; ask `lengths` first.
+            ValueError: there is no path; check `lengths` first.
         """
         goal = np.asarray(position, dtype=np.float64)
         cell = self.cell_of(goal)
@@ -178,9 +175,9 @@ class Travel:
             middle = self.room.path(cell[:2])[1:]
             middle = np.column_stack([middle, np.full(len(middle), goal[2])])
             if np.linalg.norm(goal - self.start) < 1e-6:
-                middle = middle[:0]  # it turns on the spot
+                middle = middle[:0]  # it turns in place
             return self._shortcut(np.concatenate([self.start[None], middle, goal[None]]))
-        # From the goal back to the robot: each cell knows only the one before it.
+        # From the goal back to the robot: each cell stores the one before it.
         way = [int(np.ravel_multi_index(cell, self.usable.shape))]
         previous = self.previous.reshape(-1)
         while previous[way[-1]] >= 0:
@@ -201,12 +198,12 @@ class Travel:
         return swept
 
     def _shortcut(self, points: np.ndarray) -> np.ndarray:
-        """Drops waypoints wherever the straight line past them is safe."""
+        """Removes waypoints if the straight line past them is safe."""
         last = len(points) - 1
         kept = [0]
         while kept[-1] < last:
             here = kept[-1]
-            # The goal first: most paths in a room end with one straight leg.
+            # The goal first: most paths in a room end with a straight line.
             if self._sees(points[here], points[last]):
                 kept.append(last)
                 break
@@ -250,24 +247,23 @@ def plan_travel(
     body: float = 0.0,
     room: Room | None = None,
 ) -> Travel:
-    """Plans shortest paths from a position to all safe places. Once per decision.
+    """Plans shortest paths from a position to all safe cells. Called once per decision.
 
     Args:
         grid: what is known.
         position: the robot's position in the world [m]. Outside the grid nothing is reachable.
         safety_margin: radius of the ball that must be known free [m].
-        trail: cells that the robot has come through, [X, Y, Z] bool. If its present cell is
-            not safe (a closer look found something in the margin), it may go back through them
-            unless they turned out to be occupied; otherwise they change nothing.
-        heights: lowest and highest place of the camera [m], world.
-        body: how far the robot extends down from the camera [m]
-            (`cells_over_matter`).
-        room: of a robot with a footprint: it takes the place of `safety_margin` and `body`.
+        trail: cells that the robot has come through, [X, Y, Z] bool. If its present cell is not
+            safe (a later frame showed an obstacle in the margin), it may return through them unless
+            they are occupied; otherwise they have no effect.
+        heights: lowest and highest camera position [m], world.
+        body: length of the robot below the camera [m] (`cells_over_matter`).
+        room: plan of a robot with a footprint, which replaces `safety_margin` and `body`.
 
     Raises:
         ValueError: a position that is not finite, or not at an allowed height.
     """
-    # Copied to the host once per decision; all that follows is lookups of single cells.
+    # Copied to the host once per decision, for lookups of single cells.
     free = np.array(grid.free)
     cell_size = float(grid.cell_size)
     origin = np.asarray(grid.origin, dtype=np.float64)
@@ -283,7 +279,7 @@ def plan_travel(
         safe &= ~grid.closed
     if heights != UNLIMITED:
         first, last = layers_between(heights, origin[2], cell_size, free.shape[2])
-        # Closed layers, not clipped paths: the search itself must not leave the heights.
+        # Closed layers, not clipped paths: the search itself must stay within the heights.
         safe[:, :, : max(first, 0)] = False
         safe[:, :, last + 1 :] = False
     if room is None and body > 0.0:
@@ -293,7 +289,7 @@ def plan_travel(
     is_inside = all(0 <= i < n for i, n in zip(cell, free.shape, strict=True))
     usable = safe
     if room is not None:
-        # Searched for on the plan already; the layers that are open have the same paths.
+        # Already searched on the plan; all open layers have the same paths.
         cost = np.where(safe, room.cost[:, :, None], np.inf)
         if is_inside:
             cost[cell] = 0.0
@@ -301,7 +297,7 @@ def plan_travel(
         return Travel(start, (cell[0], cell[1], cell[2]), origin, cell_size, free, safe, usable,
                       cost, previous, heights, grid.refused, room)  # fmt: skip
     if is_inside and not safe[cell]:
-        # Only a robot that is shut in gets more cells, and only those that it came through.
+        # Only a robot that is shut in gets more cells, and only those that it has passed.
         usable = safe.copy()
         if trail is not None:
             usable |= trail & ~np.asarray(grid.occupied)
@@ -324,10 +320,10 @@ def plan_travel(
 
 
 def safe_cells(free: np.ndarray, cell_size: float, margin: float) -> np.ndarray:
-    """Finds cells round whose center a ball of radius `margin` [m] touches free cells only.
+    """Finds cells around whose center a ball of radius `margin` [m] touches only free cells.
 
     Args:
-        free: cells known to be free, [X, Y, Z] bool; beyond the array nothing is.
+        free: cells known to be free, [X, Y, Z] bool; cells beyond the array are not.
         cell_size: edge of a cell [m].
         margin: radius of the ball [m].
     """
@@ -364,13 +360,13 @@ def segment_is_inside(mask: np.ndarray, a: np.ndarray, b: np.ndarray) -> bool:
 def layers_between(
     heights: tuple[float, float], origin: float, cell_size: float, num: int
 ) -> tuple[int, int]:
-    """Finds the first and the last layer of cells that hold heights [m] out of a range.
+    """Finds the first and the last layer of cells with heights [m] in a range.
 
     Args:
         heights: lowest and highest, either may be infinite.
         origin: height of the lowest cell's lower face [m].
         cell_size: edge of a cell [m].
-        num: layers that there are.
+        num: number of layers.
     """
     # Clipped before they become integers: heights may be infinite.
     low, high = np.clip((np.array(heights) - origin) / cell_size, -1.0, float(num))
@@ -385,16 +381,16 @@ def cells_over_matter(
     origin: float,
     cell_size: float,
 ) -> np.ndarray:
-    """Finds cells in which the body below the camera would overlap something known.
+    """Finds cells in which the body below the camera would overlap occupied cells.
 
     The body is a cylinder below the camera, as wide as the safety margin; of a cell the lowest
-    allowed height counts. What is unknown is open: a camera that looks ahead never sees the floor
-    at the robot's own wheels.
+    allowed height counts. Unknown cells are open: a camera that looks ahead never sees the floor at
+    the robot's wheels.
 
     Args:
         occupied: cells known to be occupied, [X, Y, Z] bool.
-        body: how far it reaches down [m]; 0: there is none.
-        margin: its radius, round the middle of a cell [m].
+        body: its length downwards [m]; 0: none.
+        margin: its radius around the center of a cell [m].
         heights: the camera's lowest and highest height [m].
         origin: height of the lowest cell's lower face [m].
         cell_size: edge of a cell [m].
@@ -410,16 +406,16 @@ def cells_over_matter(
     first, last = layers_between(heights, origin, cell_size, occupied.shape[2])
     for layer in range(max(first, 0), min(last, occupied.shape[2] - 1) + 1):
         lowest = max(origin + layer * cell_size, heights[0])
-        # The lowest allowed height of the layer is the worst case for what stands below it.
+        # The lowest allowed height of the layer is the worst case for obstacles below.
         foot = (lowest - body - origin) / cell_size
         below = max(0, int(np.floor(max(foot, -1.0) + _TOUCH)))
-        # Up to the layer below: the margin looks after the camera's own.
+        # Up to the layer below: the margin covers the camera's own layer.
         closed[:, :, layer] = wide[:, :, below:layer].any(axis=2)
     return closed
 
 
 def _widened(mask: np.ndarray, radius: float) -> np.ndarray:
-    """Grows a mask by a level disk of `radius` [cells] round the middle of each cell."""
+    """Dilates a mask by a level disk of `radius` [cells] around the center of each cell."""
     reach = int(np.ceil(radius + 0.5)) - 1
     padded = np.pad(mask, ((reach, reach), (reach, reach), (0, 0)))
     wide = mask.copy()
