@@ -1,4 +1,4 @@
-"""A run on disk: what was seen, what was decided and why, complete after every step.
+"""A run on disk: frames, decisions and their reasons, complete after every step.
 
     runs/NAME/
       run.json         format version, settings, seed, package versions, scene and its hash
@@ -10,10 +10,10 @@
       report/  models/  exports/
       .room            64 KiB for the last row of trace.jsonl, while a process writes
 
-What is read back is checked: rows and run.json end with a seal, the SHA-256 of what they say; a
-row has the hash of its view's pixels; `sha256.json` in a checkpoint has those of its files, the
-header of a model that of its numbers. What an earlier version wrote without is read unchecked.
+Everything is checked when read: rows and run.json end with a seal, the SHA-256 of their content; a
+row has the hash of its view's pixels; `sha256.json` in a checkpoint has those of its files, and the
+header of a model that of its numbers. Files of earlier versions without hashes are read unchecked.
 
-`trace.jsonl` holds nothing that depends on the machine unless the mission clock does: under
-the model clock two equal runs write equal bytes.
+`trace.jsonl` contains nothing that depends on the machine, except through the wall clock: with the
+model clock equal runs write equal bytes.
 """

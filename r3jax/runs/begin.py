@@ -1,4 +1,4 @@
-"""Runs begun, resumed, forked and merged."""
+"""Begins, resumes, forks and merges runs."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -31,7 +31,7 @@ from r3jax.simulators.base import Simulator
 
 @dataclass(frozen=True)
 class Expedition:
-    """Everything that `explore` is called with."""
+    """The arguments of `explore`."""
 
     settings: RunSettings
     simulator: Simulator
@@ -39,19 +39,19 @@ class Expedition:
     seed: int
 
     recorded: Run | None = None
-    """What was recorded before; None for a new run."""
+    """The earlier record; None for a new run."""
 
     decided_from: int = 0
-    """First view that the run's own policy chose: a fork took the earlier ones over."""
+    """First view chosen by the run's own policy; earlier ones were taken over by a fork."""
 
 
 def begin_run(
     settings: RunSettings, scene: SceneSettings, path: Path, *, overwrite: bool = False
 ) -> Expedition:
-    """Opens the scene and makes the folder of a new run, in this order.
+    """Opens the scene, then makes the folder of a new run.
 
     Raises:
-        ValueError: the scene is unknown, cannot be explored or begun in; or a run is there.
+        ValueError: the scene is unknown or cannot be explored, or the run exists.
         ImportError: its simulator is not installed.
     """
     simulator = scene.open()
@@ -63,7 +63,7 @@ def begin_run(
 
 
 def resume_run(path: Path, budget: str | None = None, until: str | None = None) -> Expedition:
-    """Goes on with a run that was cut off, interrupted or finished.
+    """Resumes a run that was interrupted or has finished.
 
     Args:
         path: the run folder.
@@ -71,15 +71,15 @@ def resume_run(path: Path, budget: str | None = None, until: str | None = None) 
         until: another goal; None keeps the run's.
 
     Raises:
-        ValueError: no run that can be gone on with; says what can be done instead.
+        ValueError: a run that cannot be resumed; says what to do instead.
     """
     run = read_run(path)
     if run.header.is_merged:
         raise InputError(f"{path} was merged from other runs: fork it with --fork and --at")
     if run.header.is_of_team:
         raise InputError(
-            f"{path} flew in a team: go on with `r3jax team --resume {path.parent}`, or fork it "
-            "with --fork and --at"
+            f"{path} is part of a team: resume it with `r3jax team --resume {path.parent}`, "
+            "or fork it with --fork and --at"
         )
     _refuse_half_a_fork(run)
     settings = settings_of_run(run).with_limits(budget, until)
@@ -95,18 +95,18 @@ def resume_run(path: Path, budget: str | None = None, until: str | None = None) 
 def fork_run(
     run: Run, at: int, settings: RunSettings, path: Path, *, overwrite: bool = False
 ) -> Expedition:
-    """Begins a run that takes over the first views of another.
+    """Begins a run with the first views of another run.
 
     Args:
-        run: the other one.
-        at: how many of its views are taken over.
-        settings: of the fork: those of `settings_of_run`, changed.
+        run: the other run.
+        at: number of its views to take over.
+        settings: of the fork: changed settings of `settings_of_run`.
         path: folder of the fork.
         overwrite: replace the run that is there.
 
     Raises:
         ValueError: no such view, a scene that has changed, a frame that cannot be read, or a run
-            that is there.
+            that exists.
     """
     if not 1 <= at <= len(run.rows):
         raise InputError(
@@ -114,8 +114,8 @@ def fork_run(
         )
     simulator = open_run_scene(run)
     fields = policy_fields(settings.policy)
-    # Asked again, a policy must know what it knew: of a merged run and of a team's that is not
-    # known from the frames.
+    # To decide again, a policy needs its earlier map, which frames of a merged run or a team do not
+    # give.
     is_alone = not (run.header.is_merged or run.header.is_of_team)
     is_same = is_alone and fields == run.header.policy
     decided_from = min(_decided_from(run), at) if is_same else at
@@ -143,21 +143,21 @@ def fork_run(
 
 
 def _refuse_half_a_fork(run: Run) -> None:
-    """Refuses a fork that was cut off while it took views over: it would diverge too early."""
+    """Refuses a fork that was interrupted while it took views over: it would diverge too early."""
     parent = run.header.parent or {}
     wanted = parent.get("views", 0) if "forked" in parent else 0
     if len(run.rows) < wanted:
         raise InputError(
-            f"{run.path} was cut off when it had {len(run.rows)} of the {wanted} "
+            f"{run.path} was interrupted after {len(run.rows)} of the {wanted} "
             f"{unit_of(run.rows)} that it takes over from {parent['forked']}: fork again, with "
             "--overwrite"
         )
 
 
 def _as_flown(rows: Sequence[StepRow]) -> list[StepRow]:
-    """Cuts the path of a choice to the part that was flown, if the path was left before its end.
+    """Cuts the path of a choice to its traveled part, if it was left before its end.
 
-    A policy that takes over is given the path, and must not count what lies ahead as visited.
+    The new policy gets the path, and must not count the rest as visited.
     """
     flown = list(rows)
     begins = [number for number, row in enumerate(rows) if row.choice is not None]
@@ -183,23 +183,22 @@ def merge_runs(
     overwrite: bool = False,
     on_frame: Callable[[], None] = lambda: None,
 ) -> MapState:
-    """Writes a run that holds the views of several, one run after the other.
+    """Writes a run with the views of several runs, one after the other.
 
-    The rows of a later run are numbered on, and its totals (clock, path, angle) added to those
-    before; what a row says of the map is of that run's own map. The stored map and grid have
-    seen all.
+    Rows are numbered consecutively, and totals (clock, path, angle) are continued; the coverage in
+    a row is that of its own run's map. The stored map and grid contain all frames.
 
     Args:
         runs: of one scene, mapped on the same terms, with the same camera.
         out: folder of the merged run.
         overwrite: replace the run that is there.
-        on_frame: called after every frame that has entered the map.
+        on_frame: called after every mapped frame.
 
     Returns:
         The map.
 
     Raises:
-        RunError: the runs do not fit together, cannot be read, or `out` cannot be written.
+        RunError: the runs do not match, cannot be read, or `out` cannot be written.
     """
     _check_apart(runs)
     for run in runs[1:]:
@@ -227,11 +226,11 @@ def _check_apart(runs: list[Run]) -> None:
     """Refuses views that would count twice.
 
     Raises:
-        RunError: a run is given twice, under whatever path.
+        RunError: a run is given twice, possibly by different paths.
     """
     for number, run in enumerate(runs):
         if any(run.path.samefile(other.path) for other in runs[:number]):
-            raise RunError(run.path, "a run is not merged with itself: give two different runs")
+            raise RunError(run.path, "both runs are the same: give two different ones")
 
 
 def _header(runs: list[Run]) -> RunHeader:

@@ -22,14 +22,14 @@ from r3jax.validation.images import MAX_PIXELS
 from r3jax.validation.json_text import build, check_type, parse_json, sealed, unsealed
 
 FORMAT = "r3jax-run"
-"""What run.json says it is."""
+"""Name of the format in run.json."""
 
 VERSION = 3
-"""Format version that this package writes. Version 1 knew no `parent`, versions 1 and 2 no `seal`;
-they are read too."""
+"""Format version that this package writes. Versions 1 (without `parent`) and 2 (without `seal`) are
+read, too."""
 
 _MAX_BYTES = 16 << 20
-"""Settings take some kilobytes."""
+"""Maximum size of run.json; settings take some kilobytes."""
 
 _LENS = ("fx", "fy", "cx", "cy")
 
@@ -54,7 +54,7 @@ class RunHeader:
     """Settings, scene and software of a run."""
 
     scene: dict[str, Any]
-    """`name` as given, `hash` of the world's content, and how it was opened."""
+    """`name` of the scene, `hash` of its content, and settings for opening it."""
 
     policy: dict[str, Any]
     """`name` and `settings`."""
@@ -63,7 +63,7 @@ class RunHeader:
     """For example `views:100`."""
 
     seed: int
-    """All randomness of the run follows from it."""
+    """Random seed."""
 
     config: dict[str, Any]
     """Settings of the loop: `exploration.config.ExplorationConfig`."""
@@ -78,25 +78,25 @@ class RunHeader:
     """Versions of the packages that shape the result, of Python, and the device."""
 
     parent: dict[str, Any] | None = None
-    """What else a run rests on: `forked` from a run, `views` of it, the run's own policy from view
-    `decided_from` on, and `decided_apart` if that run was merged or of a team; or `merged` runs
-    with `merged_views` each; or the `team` of runs, folders side by side, in which this is number
-    `member`, and that met every `meet_every` seconds."""
+    """Origin of a run made from others: `forked` from a run, `views` of it, the run's own policy
+    from view `decided_from` on, and `decided_apart` if that run was merged or of a team; or
+    `merged` runs with `merged_views` each; or the `team` of runs, folders side by side, in which
+    this is number `member`, and that met every `meet_every` seconds."""
 
     @property
     def is_merged(self) -> bool:
-        """True if the views come from several runs, each of which decided on a map of its own."""
+        """True if the views come from several runs, each with its own map."""
         return self.parent is not None and "merged" in self.parent
 
     @property
     def is_of_team(self) -> bool:
-        """True if others told this camera what they saw while it flew."""
+        """True if the camera received frames of others."""
         return self.parent is not None and "team" in self.parent
 
     @property
     def intrinsics(self) -> Camera:
         """The camera of every frame."""
-        # The size shapes what is compiled and is static; the rest is traced.
+        # The size determines compiled shapes and is static; the rest is traced.
         size = {name: int(self.camera[name]) for name in ("width", "height")}
         return Camera(**size, **{name: self.camera[name] for name in _LENS})  # pyright: ignore[reportArgumentType]
 
@@ -120,9 +120,9 @@ def plain_settings(settings: Any) -> Any:
 
 
 def policy_fields(policy: Policy) -> dict[str, Any]:
-    """Describes a policy as a header does: its name, its settings, and the class of a plug-in.
+    """Describes a policy for a header: its name, its settings, and the class of a plug-in.
 
-    For an external program they include its isolation on this system.
+    External programs also have their limits on this system.
     """
     fields = {"name": policy.name, "settings": settings_of(policy)}
     if isinstance(policy, LivesOutside):
@@ -135,11 +135,11 @@ def policy_fields(policy: Policy) -> dict[str, Any]:
 def settings_of(policy: object) -> dict[str, Any]:
     """Returns the settings of a policy that JSON can contain.
 
-    A free-flying camera's motion is left out, and so are refinement where there is none and the
-    mounting of a camera that turns by itself: that is what their absence has always meant.
+    Settings with the meaning of earlier versions are left out: the motion of a free-flying camera,
+    no refinement, and a camera that turns by itself.
     """
     settings = plain_settings(getattr(policy, "config", {}))
-    # Left out where it changes nothing: headers from before there was this setting stay equal.
+    # Left out if it has no effect, so that earlier headers stay equal.
     if settings.get("motion") == plain_settings(Motion()):
         del settings["motion"]
     elif not settings.get("motion", {}).get("fixed_camera", True):
@@ -167,9 +167,9 @@ def package_versions() -> dict[str, str]:
 
 def header_to_json(header: RunHeader) -> str:
     """Writes the text of run.json."""
-    # Format and version come first, for those who open the file by hand.
+    # Format and version first, for human readers.
     plain = {"format": FORMAT, "version": VERSION, **dataclasses.asdict(header)}
-    # NaN would become a word that `parse_json` refuses: the run could never be read.
+    # `parse_json` refuses NaN: the run could never be read.
     return json.dumps(sealed(plain), indent=2, allow_nan=False) + "\n"
 
 
@@ -186,15 +186,15 @@ def read_header(path: Path) -> RunHeader:
     except (OSError, ForeignFileError) as error:
         raise RunError(path, f"the file cannot be read ({error})") from None
     if not isinstance(plain, dict) or plain.get("format") != FORMAT:
-        raise RunError(path, f"the file does not describe a run (no format {FORMAT!r})")
-    # Before the seal and the fields: a newer version may seal and name them otherwise.
+        raise RunError(path, f"the file is not a run's (no format {FORMAT!r})")
+    # Before the seal and the fields, which a newer version may have changed.
     try:
         check_version(plain.get("version"), VERSION)
     except VersionError as error:
         raise RunError(path, f"the run has {error}") from None
     try:
         fields = unsealed(plain)
-        # They are of the file, not of the run, and `build` refuses what it does not know.
+        # They belong to the file, not to the run, and `build` refuses unknown fields.
         del fields["format"], fields["version"]
         header = build(RunHeader, fields)
         _check(header)
@@ -204,7 +204,7 @@ def read_header(path: Path) -> RunHeader:
 
 
 def _check(header: RunHeader) -> None:
-    """Refuses what types alone do not tell.
+    """Refuses values that types do not exclude.
 
     Raises:
         ValueError: says which setting makes no sense.
@@ -217,9 +217,9 @@ def _check(header: RunHeader) -> None:
     if header.is_of_team:
         _check_team(header.parent or {})
     camera = header.intrinsics
-    # Sizes from a file become sizes of arrays: a damaged one must not take all memory.
+    # Sizes from a file become sizes of arrays: a damaged file must not exhaust memory.
     if camera.width * camera.height > MAX_PIXELS:
-        raise ForeignFileError(f"images of {camera.width} x {camera.height} pixels are not read")
+        raise ForeignFileError(f"images of {camera.width} x {camera.height} pixels are too large")
     if [len(corner) for corner in header.bounds] != [3, 3]:
         raise ForeignFileError("`bounds` must be two corners of three numbers")
     lower, upper = header.bounds
@@ -228,7 +228,7 @@ def _check(header: RunHeader) -> None:
 
 
 def _check_team(parent: dict[str, Any]) -> None:
-    """Refuses what no team has.
+    """Refuses invalid fields of a team.
 
     Raises:
         ValueError: says which setting makes no sense.
@@ -236,7 +236,9 @@ def _check_team(parent: dict[str, Any]) -> None:
     check_type("parent.team", parent["team"], list[str])
     check_type("parent.meet_every", parent.get("meet_every"), float)
     if not parent["team"] or parent["meet_every"] < 0.0:
-        raise ForeignFileError("`parent` names a team without members, or that met before it began")
+        raise ForeignFileError(
+            "`parent` describes a team without members, or with a negative interval"
+        )
     # The others' runs are opened by these names: they may not lead out of the team's folder.
     for name in parent["team"]:
         check_relative(name)

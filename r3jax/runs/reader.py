@@ -1,4 +1,4 @@
-"""Reads a run folder: settings and rows at once, images on demand."""
+"""Reads a run folder: settings and rows immediately, images on demand."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -27,15 +27,15 @@ from r3jax.validation.images import image_pixels
 from r3jax.validation.json_text import check_type, parse_json, unsealed
 
 _MAX_BYTES = 256 << 20
-"""A trace has some kilobytes a view."""
+"""Maximum size of a trace, which has some kilobytes per view."""
 
 _MAX_LINES = 1 << 20
-"""Views of a run, by far."""
+"""Maximum number of lines of a trace."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """A run as it lies on disk. It may have been cut off at any moment."""
+    """A run on disk, possibly interrupted at any moment."""
 
     path: Path
     header: RunHeader
@@ -43,10 +43,10 @@ class Run:
     """One per view, in order."""
 
     end: EndRow | None
-    """How the run ended; None if it was killed (or is still going on)."""
+    """How the run ended; None if it was killed or is still running."""
 
     timings: tuple[dict[str, float], ...]
-    """Seconds per stage, one per view as far as they were written."""
+    """Times per stage [s], one entry per view if written."""
 
     @property
     def camera(self) -> Camera:
@@ -57,7 +57,7 @@ class Run:
     def outcome(self) -> str:
         """How the run ended, in a sentence."""
         if self.end is None:
-            return "cut off: the run has no final row (killed, or still going on)"
+            return "cut off: the run has no final row (killed, or still running)"
         return f"{self.end.outcome}: {self.end.message}"
 
     def image_path(self, step: int) -> Path:
@@ -77,7 +77,7 @@ class Run:
         return from_integers(*self.images(step), self.rows[step].pose, self.camera)
 
     def images(self, step: int) -> tuple[np.ndarray, np.ndarray]:
-        """Reads the images of one view as they are stored: [H, W, 3] uint8 and [H, W] uint16.
+        """Reads the stored images of one view: [H, W, 3] uint8 and [H, W] uint16.
 
         Raises:
             RunError: an image is missing, broken, or not the one that was recorded.
@@ -85,7 +85,7 @@ class Run:
         size = (self.camera.width, self.camera.height)
         rgb = read_png(self.image_path(step), *size, is_depth=False)
         depth = read_png(self.depth_path(step), *size, is_depth=True)
-        # PNG has a checksum of its own, but not against a file of another run or an edited one.
+        # PNG has its own checksum, but it does not detect edited files or those of other runs.
         if content_hash(rgb, depth) != self.rows[step].sha256:
             raise RunError(self.image_path(step), "the pixels differ from those recorded")
         return rgb, depth
@@ -99,24 +99,24 @@ class Run:
         return read_checkpoint(self.path / "checkpoints")
 
     def checkpoint_steps(self) -> list[int]:
-        """Lists the views after which a state is stored, oldest first."""
+        """Lists the views with a checkpoint, oldest first."""
         return checkpoint_steps(self.path / "checkpoints")
 
     def load_checkpoint(self, step: int) -> dict[str, dict[str, np.ndarray]]:
-        """Reads the arrays of a stored state, by table.
+        """Reads the arrays of a checkpoint, by table.
 
         Raises:
-            RunError: there is none for that view, or it cannot be read.
+            RunError: that view has no checkpoint, or it cannot be read.
         """
         return load_checkpoint(self.path / "checkpoints", step)
 
     def newest_state(self, start: LoopState) -> LoopState:
-        """Reads the newest stored state that can be used; returns `start` if there is none."""
+        """Reads the newest usable checkpoint; returns `start` if there is none."""
         return newest_state(self.path / "checkpoints", self.rows, start)
 
 
 def read_run(path: Path | str) -> Run:
-    """Reads a run folder; a run that was cut off reads up to its last complete row.
+    """Reads a run folder; an interrupted run is read up to its last complete row.
 
     Raises:
         RunError: not a run, another format version, or a row that is damaged.
@@ -130,7 +130,7 @@ def read_run(path: Path | str) -> Run:
             row = from_json(line)
         except ForeignFileError as error:
             raise RunError(path / "trace.jsonl", f"line {number}: {error}") from None
-        # Rows of views are numbered, so that a lost line is noticed; the end has no number.
+        # Rows of views are numbered, to detect lost lines; the end has no number.
         if isinstance(row, EndRow):
             end = row
         elif row.step != len(rows):
@@ -175,24 +175,24 @@ def complete_lines(path: Path) -> list[str]:
         raise RunError(path, f"the file cannot be read ({error.strerror})") from None
     except ForeignFileError as error:
         raise RunError(path, str(error)) from None
-    # Counted before it is split: as strings, short lines take many times the room of their bytes.
+    # Counted before splitting: short lines take many times their size as strings.
     if data.count(b"\n") > _MAX_LINES:
-        raise RunError(path, f"the file has more than {_MAX_LINES} lines: it is no trace")
-    # Replaced, not refused: the line that is damaged is told by its number, by who parses it.
-    # Split at \n alone: `splitlines` would also break at separators inside a text.
+        raise RunError(path, f"the file has more than {_MAX_LINES} lines: not a trace")
+    # Replaced, not refused: the parser reports the damaged line by its number. Split at \n only:
+    # `splitlines` would also split at separators inside a text.
     return data.decode("utf-8", errors="replace").split("\n")[:-1]
 
 
 def _read_timings(path: Path) -> tuple[dict[str, float], ...]:
-    """Reads the timings, leaving out lines that cannot be read: they are a by-product."""
-    # Merged runs have none, and a process may have been killed before it wrote any.
+    """Reads the timings, skipping unreadable lines."""
+    # Merged runs have none, and neither does a process that was killed early.
     if not path.exists():
         return ()
     timings: list[dict[str, float]] = []
     for line in complete_lines(path):
         try:
             plain = parse_json(line)
-            # Twice: the seal is a text among the numbers, and goes in between.
+            # Twice: the seal, a text among the numbers, is removed in between.
             check_type("timings", plain, dict[str, Any])
             plain = unsealed(plain)
             check_type("timings", plain, dict[str, float])

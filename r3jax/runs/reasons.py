@@ -1,8 +1,8 @@
-"""Why each view of a recorded run was chosen, by what was known before it was taken.
+"""Explains why each view of a recorded run was chosen, by the map before it.
 
-What a planner knew is rebuilt from the frames: the map, the grid, and which unexplored cells it had
-given up. So runs of any policy are explained, those without a utility of their own too: by
-what the view that they chose promised.
+The planner's state is rebuilt from the frames: the map, the grid, and the unexplored cells that it
+had given up. So runs of any policy can be explained by the predicted utility of the chosen views,
+even if the policy has no utility.
 
 Shape symbols: m voxels that a view sees; k cells.
 """
@@ -27,19 +27,19 @@ from r3jax.scoring.explain import Explanation
 
 @dataclass(frozen=True)
 class Reason:
-    """What one view promised when it was chosen: an `Explanation`, as small as it can be."""
+    """The predicted utility of a chosen view: a compact `Explanation`."""
 
     totals: np.ndarray
     """Utility by cause, in the order of `scoring.explain.CAUSES`, [4] float64."""
 
     rows: np.ndarray
-    """Rows of the map before the view that it was to see, [m]."""
+    """Rows of the earlier map in view, [m]."""
 
     shares: np.ndarray
     """1 - R of each of them, by cause: too oblique, inconsistent, too far, [3, m] float32."""
 
     cells: np.ndarray
-    """Centers of the unexplored cells that it was to see [m], [k, 3] float32."""
+    """Centers of the unexplored cells in view [m], [k, 3] float32."""
 
     @property
     def utility(self) -> float:
@@ -48,7 +48,7 @@ class Reason:
 
 
 def reason_of(explanation: Explanation, grid: OccupancyGrid) -> Reason:
-    """Summarizes an explanation for what the view sees.
+    """Reduces an explanation to the voxels and cells in view.
 
     Args:
         explanation: of one view.
@@ -67,22 +67,21 @@ def reason_of(explanation: Explanation, grid: OccupancyGrid) -> Reason:
 def explain_run(
     run: Run, states: Iterable[tuple[MapState, OccupancyGrid]] | None = None
 ) -> Iterator[Reason | None]:
-    """Explains why each view of a run was chosen, in order; takes as long as mapping took.
+    """Explains why each view of a run was chosen, in order; takes as long as mapping.
 
     Args:
-        run: not a merged one: each of its runs decided on a map of its own.
+        run: not a merged run, whose parts decided on separate maps.
         states: the map and the grid after each view, in order; by default rebuilt from the frames.
-            The state after a view is read with the reason of the next one.
 
     Yields:
-        The reason of each view; None for the first, which was not chosen. Where frames were
-        captured while moving, it stands in the first row of the path, as the choice does.
+        The reason of each view; None for the first, which was not chosen. If frames were captured
+        while moving, it belongs to the first row of the path, like the choice.
 
     Raises:
-        RunError: the run was merged, or is a fork of one that was or that flew in a team; a
-            setting of it is not known, a frame is missing or broken.
+        RunError: the run was merged, or is a fork of a merged run or a team's; a setting is
+            unknown, a frame is missing or broken.
     """
-    # First: rebuilding the map takes minutes, and would show a map on which no view was decided.
+    # First: rebuilding the map takes minutes, and no view was decided on the merged map.
     check_decided_alone(run)
     if is_decided_apart(run):
         raise RunError(
@@ -100,12 +99,12 @@ def explain_run(
             pose, (map_state, grid) = before
             memory = memory or initial_state(run.camera, grid, motion=config.motion)
             choice = row.choice
-            # The memory goes from view to view: cells that were given up count for nothing later.
+            # The memory is passed from view to view: cells that were given up do not count later.
             memory, explanation = explain_path(
                 memory, map_state, grid, pose, choice.pose, choice.waypoints, config
             )
             yield reason_of(explanation, grid)
-        if row is not run.rows[-1]:  # nothing was decided on the last map
+        if row is not run.rows[-1]:  # no decision was made on the last map
             before = np.asarray(row.pose, dtype=np.float64), next(after_views)
             if row.captured:
                 camera, pose = run.camera, jnp.asarray(row.pose)

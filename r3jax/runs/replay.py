@@ -1,4 +1,4 @@
-"""Recorded frames rebuild the map and the grid of a run, and those of several runs together."""
+"""Rebuilds the map and the grid from the recorded frames of one or several runs."""
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -17,13 +17,13 @@ from r3jax.runs.settings import config_of
 
 @dataclass(frozen=True)
 class Difference:
-    """An array of a stored state that frames do not rebuild."""
+    """An array of a stored state that differs from the rebuilt one."""
 
     name: str
-    """Such as `map.visited`."""
+    """Its name, such as `map.visited`."""
 
     num_different: int
-    """Elements that differ; -1 if the shapes do."""
+    """Number of different elements; -1 if the shapes differ."""
 
     largest: float
     """The largest difference of two elements."""
@@ -36,7 +36,7 @@ def rebuild(
 
     Args:
         runs: of one scene: the same box, cells, voxels and range.
-        views: first views of each run; None: all.
+        views: number of first views of each run; None: all.
         on_frame: called after every frame that has entered the map.
 
     Raises:
@@ -46,14 +46,12 @@ def rebuild(
 
 
 def rebuild_team(runs: Sequence[Run]) -> tuple[MapState, OccupancyGrid]:
-    """Rebuilds the map and the grid of a team after its last meeting.
-
-    All frames are added in the order of the clock.
+    """Rebuilds a team's map and grid after its last meeting, all frames in the clock's order.
 
     Raises:
         RunError: the runs do not fit together, or a frame is missing or broken.
     """
-    # The order in which the team shared them, ties by number: another one gives other bits.
+    # The order in which the team shared them, ties by number: another order changes the last bits.
     steps = sorted((row.seconds, n, row.step) for n, run in enumerate(runs) for row in run.rows)
     return _last(runs, ((runs[number], step) for _, number, step in steps))
 
@@ -62,7 +60,7 @@ def states_of(run: Run) -> Iterator[tuple[MapState, OccupancyGrid]]:
     """Rebuilds the map and the grid after each view of a run, in order, lazily.
 
     Raises:
-        RunError: no view, settings that cannot work, or a frame that is missing or broken.
+        RunError: no view, invalid settings, or a frame that is missing or broken.
     """
     return _states([run], ((run, row.step) for row in run.rows))
 
@@ -73,7 +71,7 @@ def _last(
     on_frame: Callable[[], None] = lambda: None,
 ) -> tuple[MapState, OccupancyGrid]:
     """Rebuilds the map and the grid after all frames, each given by its run and number."""
-    # Before the first frame: mapping takes minutes, and a misfit is reported at once.
+    # Before the first frame: mapping takes minutes, and mismatches are reported immediately.
     for run in runs[1:]:
         check_alike(runs[0], run)
     state = _first(runs)
@@ -100,22 +98,22 @@ def _first(runs: Sequence[Run]) -> tuple[MapState, OccupancyGrid]:
 
 
 def team_of(run: Run) -> list[Run]:
-    """Reads the runs of all members of the team that a run flew in, in order.
+    """Reads the runs of all members of a run's team, in order.
 
     Raises:
-        RunError: it flew in none; one is missing, or was cut off before the last meeting.
+        RunError: it has no team; a member is missing, or was interrupted before the last meeting.
     """
     names = (run.header.parent or {}).get("team")
     if not names:
-        raise RunError(run.path, "it flew in no team")
+        raise RunError(run.path, "it is not part of a team")
     team = [read_run(run.path.parent / name) for name in names]
     for member in team:
-        # Only the last meeting brings every frame into the stored maps: until then they differ.
+        # Stored maps only contain all frames after the last meeting.
         if member.end is None:
             raise RunError(
                 member.path,
-                "the team was cut off before its last meeting: go on with `r3jax team --resume "
-                f"{run.path.parent}`",
+                "the team was interrupted before its last meeting: resume it with "
+                f"`r3jax team --resume {run.path.parent}`",
             )
     return team
 
@@ -124,10 +122,10 @@ def grid_before(runs: Sequence[Run]) -> OccupancyGrid:
     """Makes the grid before the first view of runs in one scene.
 
     Raises:
-        RunError: a run without a view, or settings that cannot work.
+        RunError: a run without a view, or invalid settings.
     """
     bounds = np.asarray(runs[0].header.bounds, dtype=np.float64)
-    # Every start before any frame: each camera stood in free space that no image shows.
+    # All starts before any frame: the space around each start is free, but in no image.
     starts = [pose for run in runs for pose in starts_of(run)]
     try:
         return first_grid(bounds, starts, config_of(runs[0]))
@@ -136,19 +134,21 @@ def grid_before(runs: Sequence[Run]) -> OccupancyGrid:
 
 
 def check_decided_alone(run: Run) -> None:
-    """Refuses a run whose own frames do not tell on which map its views were decided.
+    """Refuses a run whose views were not decided on the map of its own frames.
 
     Raises:
-        RunError: it was merged, or flew in a team.
+        RunError: it was merged, or is part of a team.
     """
     if run.header.is_merged:
-        raise RunError(run.path, "it was merged from runs that decided each for itself")
+        raise RunError(run.path, "it was merged from runs with separate maps")
     if run.header.is_of_team:
-        raise RunError(run.path, "it flew in a team, and decided on what others had seen, too")
+        raise RunError(
+            run.path, "it is part of a team, and its views were also decided on frames of others"
+        )
 
 
 def is_decided_apart(run: Run) -> bool:
-    """Returns True for a fork with views that were decided on another map than its frames give."""
+    """Returns True for a fork with views that were decided on another map than its frames'."""
     return bool((run.header.parent or {}).get("decided_apart", False))
 
 
@@ -157,19 +157,19 @@ def differences(
 ) -> tuple[int, list[Difference]]:
     """Finds the differences between the newest stored map and grid and those rebuilt from frames.
 
-    For a run that flew in a team, the frames of all its members are used.
+    For a run of a team, the frames of all members are used.
 
     Args:
         run: with a stored map.
-        on_frame: called after every frame that has entered the map, where the run flew alone.
+        on_frame: called after every mapped frame, if the run is not part of a team.
 
     Returns:
-        The views that were compared, and every array that differs.
+        The number of compared views, and all arrays that differ.
 
     Raises:
-        RunError: no checkpoint, or one or a frame that cannot be read; a team that was cut off.
+        RunError: no checkpoint, an unreadable checkpoint or frame, an interrupted team.
     """
-    # It may be older than the last row: checkpoints are left out while one is being written.
+    # It may be older than the last row: checkpoints are skipped while one is being written.
     step, stored_map, stored_grid = run.checkpoint()
     team = [run]
     if run.header.is_of_team:
@@ -190,37 +190,37 @@ def _compare(name: str, stored: jax.Array, rebuilt: jax.Array) -> Difference | N
     a, b = np.asarray(stored), np.asarray(rebuilt)
     if a.shape != b.shape:
         return Difference(name, -1, float("inf"))
-    # No tolerance: frames enter the map as they are stored, so a rebuilt map is equal bit by bit.
+    # No tolerance: frames are mapped in their stored form, so that a rebuilt map is bit-identical.
     different = a != b
     if not different.any():
         return None
-    # As float64: unsigned integers would wrap round, and Booleans cannot be subtracted.
+    # As float64: unsigned integers would wrap around, and Booleans cannot be subtracted.
     gap = np.abs(a.astype(np.float64) - b.astype(np.float64))
     return Difference(name, int(different.sum()), float(gap.max()))
 
 
 def parts_of(run: Run) -> list[int]:
-    """Returns the number of views of each run in a merged one; of any other run, all its views."""
+    """Returns the number of views of each part of a merged run, or of the whole run."""
     return (run.header.parent or {}).get("merged_views", [len(run.rows)])
 
 
 def starts_of(run: Run) -> list[np.ndarray]:
-    """Returns the poses at which a run began; a merged one began several times."""
+    """Returns the initial poses of a run; a merged run has several."""
     if not run.rows:
         raise RunError(run.path, "the run has no view")
-    # The last part begins no other: its sum would be one past the last row.
+    # No part follows the last one: its sum would be one past the last row.
     begins = itertools.accumulate(parts_of(run)[:-1], initial=0)
     return [np.asarray(run.rows[step].pose, dtype=np.float64) for step in begins]
 
 
 def check_alike(first: Run, other: Run) -> None:
-    """Refuses runs that did not map the same scene on the same terms."""
+    """Refuses runs that did not map the same scene with the same settings."""
     a, b = first.header, other.header
     terms = [
         ("the scene", a.scene.get("hash"), b.scene.get("hash")),
         ("the box", a.bounds, b.bounds),
     ]
-    # What decides how a pixel enters the map or the grid; speed, budget and clock do not.
+    # Settings that affect mapping; speed, budget and clock do not.
     for name in ("voxel_size", "num_bins", "cell_size", "max_range", "drop_edges"):
         terms.append((name, a.config.get(name), b.config.get(name)))
     for name, mine, others in terms:

@@ -1,4 +1,4 @@
-"""The rows of trace.jsonl, one per view and one that says how the run ended, and their path.
+"""The rows of trace.jsonl: one per view, one for the end of the run; and their paths.
 
 Shape symbols: K, L waypoints.
 """
@@ -25,10 +25,10 @@ class EndRow:
     """`budget`, `no-reachable-candidate`, `interrupted`, ...: `exploration.state.StopReason`."""
 
     message: str
-    """The same in a sentence."""
+    """The reason in a sentence."""
 
     views: int
-    """Views recorded."""
+    """Number of recorded views."""
 
 
 def to_json(row: StepRow | EndRow) -> str:
@@ -36,10 +36,9 @@ def to_json(row: StepRow | EndRow) -> str:
     kind = "step" if isinstance(row, StepRow) else "end"
     plain = {"kind": kind, **dataclasses.asdict(row, dict_factory=_plain_dict)}
     if not plain.get("captured", True):
-        del plain["captured"]  # as rows were before there were captures
+        del plain["captured"]  # as in rows of versions without captures
     if not plain.get("hidden", True):
-        del plain["hidden"]  # nor was there planning while moving
-    # No blanks and a fixed order: under the model clock equal runs are equal bytes.
+        del plain["hidden"]  # as in rows of versions without planning while moving
     return json.dumps(sealed(plain), allow_nan=False, separators=(",", ":"))
 
 
@@ -53,11 +52,11 @@ def from_json(line: str) -> StepRow | EndRow:
     plain = parse_json(line)
     if not isinstance(plain, dict) or plain.get("kind") not in ("step", "end"):
         raise ForeignFileError("a row is an object with the kind `step` or `end`")
-    # The seal comes before the fields: a flipped digit is told as damage, not as an odd number.
+    # The seal before the fields: a flipped digit is reported as damage, not as an odd number.
     plain = unsealed(plain)
     if plain.pop("kind") == "end":
         return build(EndRow, plain)
-    # Arrays and nested records are made here, as `build` knows what JSON knows.
+    # Arrays and nested records are made here; `build` only handles JSON's types.
     row = build(
         StepRow,
         plain,
@@ -65,14 +64,14 @@ def from_json(line: str) -> StepRow | EndRow:
         choice=None if plain.get("choice") is None else _choice(plain["choice"]),
         coverage=build(Coverage, plain.get("coverage")),
     )
-    # It becomes a file name and an index, where -1 would be the last.
+    # It becomes a file name and an index, for which -1 would be the last.
     if row.step < 0:
         raise ForeignFileError(f"`step` must not be negative, got {row.step}")
     return row
 
 
 def _choice(plain: Any) -> Choice:
-    # What is no object is refused by `build`, which says so.
+    # `build` refuses what is not an object.
     known: dict[str, Any] = plain if isinstance(plain, dict) else {}
     waypoints = table_of("waypoints", known.get("waypoints"), (-1, 3))
     return build(
@@ -81,13 +80,13 @@ def _choice(plain: Any) -> Choice:
 
 
 def rigid_pose(name: str, values: Any) -> np.ndarray:
-    """Makes a pose [4, 4] float32 of what JSON holds of it.
+    """Makes a pose [4, 4] float32 from JSON.
 
     Raises:
-        ForeignFileError: no table of finite numbers, or not rigid; says which `name`.
+        ForeignFileError: not a table of finite numbers, or not rigid; gives its `name`.
     """
     pose = table_of(name, values, (4, 4))
-    # A matrix that scales or mirrors would still project, to wrong places.
+    # A matrix with scale or mirroring would still project, to wrong positions.
     problem = rigid_error(pose)
     if problem is not None:
         raise ForeignFileError(f"`{name}`: {problem}")
@@ -95,15 +94,15 @@ def rigid_pose(name: str, values: Any) -> np.ndarray:
 
 
 def table_of(name: str, values: Any, shape: tuple[int, int]) -> np.ndarray:
-    """Makes a table float32 of what JSON holds of it; -1 stands for any number of rows.
+    """Makes a float32 table from JSON; -1 allows any number of rows.
 
     Raises:
-        ForeignFileError: no table of finite numbers of that shape; says which `name`.
+        ForeignFileError: not a table of finite numbers of that shape; gives its `name`.
     """
     try:
         with np.errstate(over="ignore"):  # too large for float32: found with the infinities
             found = np.asarray(values)
-            # Checked first: a text such as "1" would become a number.
+            # Checked first: a string such as "1" would become a number.
             if found.dtype.kind not in "iuf":
                 raise TypeError(found.dtype)
             table = found.astype(np.float32)
@@ -120,10 +119,10 @@ def table_of(name: str, values: Any, shape: tuple[int, int]) -> np.ndarray:
 
 
 def shortest_floats(array: np.ndarray) -> list[Any]:
-    """Makes nested lists of the shortest decimals that read back as the same float32 numbers."""
+    """Converts to nested lists of the shortest decimals that give the same float32 numbers."""
     if array.ndim > 1:
         return [shortest_floats(part) for part in array]
-    # str of a float32 is its shortest decimal; as a float64 it would drag along digits of noise.
+    # str of a float32 is its shortest decimal; as a float64 it would have digits of noise.
     return [float(str(value)) for value in array.astype(np.float32)]
 
 
@@ -135,14 +134,14 @@ def _plain_dict(items: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def paths_to(rows: Iterable[StepRow]) -> Iterator[np.ndarray | None]:
-    """Follows the path of the camera, row by row.
+    """Yields the path of the camera, row by row.
 
     Args:
         rows: of a trace, from the first one on.
 
     Yields:
-        Waypoints from the row before to this one, [K, 3] float64 [m]; None where nothing was flown:
-        at the start, and where another run of a merged one begins.
+        Waypoints from the row before to this one, [K, 3] float64 [m]; None without a path: at the
+        start, and at the start of each part of a merged run.
     """
     before: StepRow | None = None
     waypoints, begin = np.zeros((0, 3)), 0.0
@@ -151,17 +150,17 @@ def paths_to(rows: Iterable[StepRow]) -> Iterator[np.ndarray | None]:
             waypoints = np.zeros((0, 3))
             yield None
         else:
-            if row.choice is not None:  # where frames are captured it stands in the first one's row
+            if row.choice is not None:  # with captures it is in the row of the path's first frame
                 waypoints, begin = row.choice.waypoints.astype(np.float64), before.metres
             piece = piece_of_path(waypoints, before.metres - begin, row.metres - begin)
-            # Exactly from frame to frame: lengths along the path are rounded.
+            # Exactly from frame to frame, as lengths along the path are rounded.
             piece[0], piece[-1] = before.pose[:3, 3], row.pose[:3, 3]
             yield piece
         before = row
 
 
 def piece_of_path(waypoints: np.ndarray, begin: float, end: float) -> np.ndarray:
-    """Cuts the piece between two lengths [m] out of a path over waypoints [K, 3], [L, 3] [m]."""
+    """Returns the piece between two lengths [m] of a path over waypoints [K, 3], [L, 3] [m]."""
     if len(waypoints) < 2:
         return np.zeros((2, 3))
     steps = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)

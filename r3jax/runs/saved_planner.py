@@ -1,4 +1,4 @@
-"""A planner on disk: what it knows, what its policy remembers, and all of its settings.
+"""A planner on disk: its map and grid, its policy's memory, and all of its settings.
 
     NAME/  planner.json  000000/
 
@@ -40,20 +40,22 @@ _MAX_BYTES = 1 << 20
 
 @checked(planner=a_planner)
 def save(planner: Planner, path: str | Path) -> None:
-    """Saves a planner, so that `load` goes on with it, on another machine if need be.
+    """Saves a planner for `load`, also on another machine.
 
     Args:
-        planner: of a policy whose memory is arrays; that of a program is not.
-        path: a folder that is new, empty, or holds a planner saved earlier, which is replaced.
+        planner: with a policy whose memory consists of arrays, not an external program.
+        path: a new or empty folder, or one with an earlier saved planner, which is replaced.
 
     Raises:
-        ValueError: a policy that does not say its camera.
+        ValueError: a policy without a camera.
         OSError: the disk is full, not writable, ...; or something else is there.
     """
     folder = Path(path)
     camera = getattr(planner.policy_state, "camera", None)
     if not isinstance(camera, Camera):
-        raise InputError(f"the policy {planner.policy.name!r} cannot be saved: it keeps no camera")
+        raise InputError(
+            f"the policy {planner.policy.name!r} cannot be saved: its memory has no camera"
+        )
     files.own_folder(folder, "planner")
     tables = map_tables(planner.map_state, planner.grid)
     tables["policy"] = named_arrays(planner.policy_state)
@@ -67,7 +69,7 @@ def save(planner: Planner, path: str | Path) -> None:
     steps = [int(at.name) for at in numbered(folder)]
     number = max(steps, default=-1) + 1
     write_checkpoint(folder / f"{number:06d}", {k: to_storable(v) for k, v in tables.items()})
-    # The arrays are whole before the file names them: cut off anywhere, the old planner is there.
+    # The arrays are complete before the file refers to them: if interrupted, the old planner stays.
     text = json.dumps(sealed(plain | {"arrays": f"{number:06d}"}), indent=2, allow_nan=False)
     files.write_atomic(folder / "planner.json", (text + "\n").encode())
     for old in numbered(folder)[:-1]:
@@ -75,7 +77,7 @@ def save(planner: Planner, path: str | Path) -> None:
 
 
 def load(path: str | Path) -> Planner:
-    """Loads a planner that `save` has written.
+    """Loads a planner written by `save`.
 
     Raises:
         RunError: it is missing, damaged, or of a newer version; names the file.
@@ -90,7 +92,7 @@ def load(path: str | Path) -> Planner:
     except (OSError, ForeignFileError) as error:
         raise RunError(file, f"the file cannot be read ({error})") from None
     if not isinstance(plain, dict) or plain.get("format") != FORMAT:
-        raise RunError(file, f"the file does not describe a planner (no format {FORMAT!r})")
+        raise RunError(file, f"the file is not a saved planner's (no format {FORMAT!r})")
     if plain.get("version") != VERSION:
         raise RunError(
             file,
@@ -137,7 +139,7 @@ def _planner_of(
     map_state = fill(
         empty_map(2, config.voxel_size, num_bins, remove_moved="misses" in arrays), arrays
     )
-    # Like a grid of one cell; which of its optional arrays there are, the file says.
+    # Like a grid of one cell; the file lists its optional arrays.
     small = empty_grid(np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]), config.cell_size)
     optional = {"worth_a_look": bool, "marks": np.uint8}
     extra = {name: jnp.zeros(small.log_odds.shape, kind) for name, kind in optional.items()

@@ -29,10 +29,10 @@ class RunSettings:
     policy: Policy
 
     def with_limits(self, budget: str | None, until: str | None) -> "RunSettings":
-        """Replaces the budget or the goal where one is given.
+        """Replaces the budget or the goal if given.
 
         Raises:
-            ValueError: a budget or a goal that cannot work.
+            ValueError: an invalid budget or goal.
         """
         changed = self
         if budget is not None:
@@ -44,13 +44,13 @@ class RunSettings:
 
 
 def config_of(run: Run) -> ExplorationConfig:
-    """Reads the settings of the loop that a run was made with.
+    """Reads the settings of a run's loop.
 
     Raises:
         RunError: a setting that this version does not know, or cannot work with.
     """
     try:
-        # A setting that is not known may have shaped the map: it is refused, not left out.
+        # Unknown settings may affect the map: they are refused, not ignored.
         return ExplorationConfig(**run.header.config)
     except (TypeError, ValueError) as error:
         raise RunError(run.path / "run.json", f"a setting of the loop: {error}") from None
@@ -60,7 +60,7 @@ def policy_key(run: Run) -> str:
     """Returns the name by which `make_policy` finds a run's policy, or the class of a plug-in.
 
     Raises:
-        KeyError: the header does not say.
+        KeyError: the header has no name.
     """
     policy = run.header.policy
     return str(policy.get("class") or policy["name"])
@@ -69,7 +69,7 @@ def policy_key(run: Run) -> str:
 def _config_class(run: Run) -> type[PlannerConfig]:
     """Finds the class of the settings of a run's policy.
 
-    If the policy is not available, it is the class that all policies share.
+    If the policy is not available, it is `PlannerConfig`.
     """
     try:
         return config_class(policy_key(run))
@@ -78,7 +78,7 @@ def _config_class(run: Run) -> type[PlannerConfig]:
 
 
 def planner_config_of(run: Run) -> PlannerConfig:
-    """Reads the settings of the policy that a run was made with.
+    """Reads the settings of a run's policy.
 
     Raises:
         RunError: a setting that this version does not know, or cannot work with.
@@ -88,7 +88,7 @@ def planner_config_of(run: Run) -> PlannerConfig:
         scoring = scoring_config_of(settings.pop("scoring", {}))
         motion = motion_of_record(settings.pop("motion", None))
         kind = _config_class(run)
-        # Runs of all policies once recorded settings of one: dropped where they mean nothing.
+        # Runs of all policies once recorded settings of one: dropped for others.
         own = {field.name for field in fields(kind)}
         settings = {k: v for k, v in settings.items() if k in own or k not in FORMER_SETTINGS}
         return kind(scoring=scoring, motion=motion, **settings)
@@ -100,7 +100,7 @@ def settings_of_run(run: Run) -> RunSettings:
     """Reads the settings of a recorded run.
 
     Raises:
-        RunError: a policy or a setting that this version does not know.
+        RunError: a policy or a setting that is unknown in this version.
     """
     header = run.header
     try:
@@ -114,7 +114,7 @@ def settings_of_run(run: Run) -> RunSettings:
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """How a scene is opened: a line of a run's header, but for the camera and the seed."""
+    """Settings for opening a scene, except the camera and the seed."""
 
     name: str
     """An embedded scene, or one of `outside_scenes`."""
@@ -123,22 +123,22 @@ class SceneSettings:
     seed: int
 
     noise: float = 0.01
-    """Standard deviation of the depth as a share of the depth."""
+    """Standard deviation of the depth noise, relative to the depth."""
 
     max_range: float | None = 5.0
-    """Reach of the depth sensor [m]; None: unlimited."""
+    """Range of the depth sensor [m]; None: unlimited."""
 
     up: Literal["y", "z"] | None = None
     """Vertical axis of a mesh file."""
 
     scale: float = 1.0
-    """Meters in a unit of a mesh file."""
+    """Unit of a mesh file [m]."""
 
     cull_backfaces: bool = False
-    """Faces seen from behind are looked through."""
+    """Do not render back faces."""
 
     start: tuple[float, float, float] | None = None
-    """Start position [m], looking along x; None: the scene's own, or a search."""
+    """Start position [m], looking along x; None: the scene's own, or found by a search."""
 
     def open(self) -> Simulator:
         """Opens the scene.
@@ -161,21 +161,21 @@ class SceneSettings:
 
 
 _RECORDED = ("up", "scale", "cull_backfaces", "noise", "max_range", "start")
-"""What a header keeps of `SceneSettings`, beside the name."""
+"""Fields of `SceneSettings` in a header, beside the name."""
 
 
 def scene_of_run(run: Run) -> SceneSettings:
-    """Reads how the scene of a recorded run was opened.
+    """Reads the scene's settings of a recorded run.
 
     Raises:
-        RunError: the header does not say.
+        RunError: the header is incomplete.
     """
     scene = run.header.scene
-    # Headers of earlier versions do not have the fields added since.
+    # Headers of earlier versions lack fields added since. # words: ok
     given: dict[str, Any] = {"up": None, "scale": 1.0, "cull_backfaces": False} | scene
     try:
         how: dict[str, Any] = {name: given[name] for name in _RECORDED}
-        if how["start"] is not None:  # JSON knows lists alone
+        if how["start"] is not None:  # JSON only has lists
             how["start"] = tuple(how["start"])
     except KeyError as error:
         raise RunError(run.path / "run.json", f"the scene is missing {error}") from None
@@ -183,10 +183,10 @@ def scene_of_run(run: Run) -> SceneSettings:
 
 
 def open_run_scene(run: Run) -> Simulator:
-    """Opens the scene of a recorded run, as it was.
+    """Opens the scene of a recorded run.
 
     Raises:
-        RunError: the scene is not the one that the run was recorded in.
+        RunError: the scene has changed.
         ValueError: the scene is unknown, or its file is refused.
     """
     settings = scene_of_run(run)
@@ -201,11 +201,11 @@ def open_run_scene(run: Run) -> Simulator:
 
 
 def new_header(settings: RunSettings, scene: SceneSettings, simulator: Simulator) -> RunHeader:
-    """Makes the header of a new run: all that fixes it.
+    """Makes the header of a new run.
 
     Args:
         settings: of the run.
-        scene: how the scene was opened.
+        scene: settings of the scene.
         simulator: the scene, opened.
     """
     how = {name: getattr(scene, name) for name in _RECORDED}
@@ -222,7 +222,7 @@ def new_header(settings: RunSettings, scene: SceneSettings, simulator: Simulator
 
 
 def changed_versions(run: Run) -> list[str]:
-    """Lists the packages that are not those a run was begun with, as `jax 0.9 -> 0.10`."""
+    """Lists packages whose versions changed since the run began, as `jax 0.9 -> 0.10`."""
     now, then = package_versions(), run.header.packages
     return [f"{k} {then.get(k)} -> {v}" for k, v in now.items() if then.get(k) != v]
 

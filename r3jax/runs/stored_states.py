@@ -1,8 +1,7 @@
 """The loop's state on disk after every view, saved with Orbax in the background.
 
-A checkpoint holds tables of named arrays: `map`, `grid`, `policy` and `loop`. It is a short cut,
-never the only copy: frames and rows rebuild all of it. Checkpoints of earlier versions of this
-package hold `map` and `grid` only.
+A checkpoint holds tables of named arrays: `map`, `grid`, `policy` and `loop`. It is a cache: frames
+and rows suffice to rebuild it. Checkpoints of earlier versions contain only `map` and `grid`.
 """
 
 import contextlib
@@ -33,26 +32,26 @@ from r3jax.mapping.state import MapState
 from r3jax.runs.header import RunError
 from r3jax.validation.errors import ForeignFileError
 
-# Not one: if the newest is damaged, an older one still saves most of the mapping.
+# More than one: if the newest is damaged, an older one still saves most of the mapping.
 KEPT = 3
-"""Older checkpoints are deleted."""
+"""Number of checkpoints to keep."""
 
 
 _APART = ("planner", "leg", "planned")
 
 _LOOP = tuple(field.name for field in fields(LoopState) if field.name not in _APART)
-"""Fields of the state in the table `loop`; what the planner holds has tables of its own, and what
-is under way is decided again."""
+"""Fields of the state in the table `loop`; the planner has its own tables, and an unfinished path
+is decided again."""
 
 _LATER = {"captured": np.asarray(0)}
-"""Fields that came after the first checkpoints, as they were then."""
+"""Fields missing in the first checkpoints, with their values at that time."""
 
 
 class CheckpointWriter:
-    """Saves checkpoints one after the other in a thread of its own; each is whole or absent."""
+    """Saves checkpoints one after the other in its own thread; each is complete or absent."""
 
     def __init__(self, folder: Path):
-        """Makes the folder and clears away what a killed process left behind.
+        """Makes the folder and removes leftovers of killed processes.
 
         Raises:
             OSError: the folder is a link, or cannot be made.
@@ -64,23 +63,23 @@ class CheckpointWriter:
         self._under_way: Future[None] | None = None
 
     def save(self, step: int, tables: Tables, *, wait: bool = False) -> bool:
-        """Begins to save the state after view `step`, unless the one before is still being saved.
+        """Starts to save the state after view `step`, unless the previous one is still being saved.
 
-        A map of gigabytes takes longer to write than a step takes: then there is a checkpoint
-        every few views, and the mission is not held up.
+        Writing a map of gigabytes takes longer than a step: then there is a checkpoint every few
+        views, without delaying the mission.
 
         Args:
             step: number of the view.
-            tables: the state; its arrays must not be written afterwards.
-            wait: True waits for the one before, and for this one.
+            tables: the state; its arrays must not be modified afterwards.
+            wait: True waits for the previous one, and for this one.
 
         Returns:
-            Whether it is being saved.
+            True if it is being saved.
 
         Raises:
-            OSError: the one before, or with `wait` this one, could not be written.
+            OSError: the previous one, or with `wait` this one, could not be written.
         """
-        # Leaving one out costs some frames at a resume; waiting would cost time of the mission.
+        # Skipping one costs some frames when resuming; waiting would delay the mission.
         if self._under_way is not None and not wait and not self._under_way.done():
             return False
         self.wait()  # it is done, but may have failed: this is where the loop hears of it
@@ -103,15 +102,15 @@ class CheckpointWriter:
             under_way.result()
 
     def _write(self, step: int, tree: dict[str, dict[str, np.ndarray]]) -> None:
-        """In the thread: writes one and discards all but the newest three."""
-        # The new one is whole before an old one goes, so that there is always one to resume from.
+        """Writes a checkpoint, and deletes all but the newest three. Runs in the thread."""
+        # The new one is complete before an old one is deleted, so that one always exists.
         write_checkpoint(self._folder / f"{step:06d}", tree)
         for old in numbered(self._folder)[:-KEPT]:
             discard(old)
 
     def close(self) -> None:
-        """Waits and ends the thread. What `wait` would say of the last one is lost."""
-        # Nothing is lost with it: frames and rows rebuild the state.
+        """Waits and ends the thread. An error of the last checkpoint is ignored."""
+        # Frames and rows suffice to rebuild the state.
         with contextlib.suppress(OSError):
             self.wait()
         self._thread.shutdown()
@@ -123,10 +122,10 @@ def checkpoint_steps(folder: Path) -> list[int]:
 
 
 def load_checkpoint(folder: Path, step: int) -> dict[str, dict[str, np.ndarray]]:
-    """Reads the tables that were stored after view `step`.
+    """Reads the checkpoint after view `step`.
 
     Raises:
-        RunError: it is not there, damaged, or it cannot be read.
+        RunError: it is missing, damaged, or cannot be read.
     """
     path = folder / f"{step:06d}"
     try:
@@ -136,14 +135,14 @@ def load_checkpoint(folder: Path, step: int) -> dict[str, dict[str, np.ndarray]]
             path,
             f"the checkpoint cannot be read ({error}); resuming the run rebuilds it",
         ) from None
-    # Orbax restores any tree; only two levels are tables of arrays.
+    # Orbax restores any tree; tables of arrays have two levels.
     if not all(isinstance(table, dict) for table in tables.values()):
         raise RunError(path, "the checkpoint does not hold tables of arrays")
     return {name: from_storable(table) for name, table in tables.items()}
 
 
 def to_storable(table: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Replaces arrays without elements, which Orbax refuses, by names that say what they are."""
+    """Replaces empty arrays, which Orbax refuses, by names that describe them."""
 
     def named(name: str, x: np.ndarray) -> str:
         return name if x.size else f"{name} empty {x.dtype.str} {list(x.shape)}"
@@ -175,7 +174,7 @@ def read_checkpoint(folder: Path) -> tuple[int, MapState, OccupancyGrid]:
     tables = load_checkpoint(folder, steps[-1])
     try:
         arrays: dict[str, Any] = {name: jnp.asarray(x) for name, x in tables["map"].items()}
-        # It is static in MapState, a part of what is compiled, and no array there.
+        # It is static in MapState, not an array.
         num_bins = int(arrays.pop("num_bins"))
         grid = {name: jnp.asarray(x) for name, x in tables["grid"].items()}
         return steps[-1], MapState(**arrays, num_bins=num_bins), OccupancyGrid(**grid)
@@ -191,32 +190,32 @@ def map_tables(map_state: MapState, grid: OccupancyGrid) -> dict[str, dict[str, 
 
 
 def state_tables(state: LoopState) -> dict[str, dict[str, np.ndarray]]:
-    """Returns the tables that a checkpoint of the state contains."""
+    """Returns the tables of a checkpoint of the state."""
     tables = map_tables(state.map_state, state.grid)
     tables["policy"] = named_arrays(state.policy_state)
     return tables | {"loop": {name: np.asarray(getattr(state, name)) for name in _LOOP}}
 
 
 def newest_state(folder: Path, rows: Sequence[StepRow], start: LoopState) -> LoopState:
-    """Reads the newest stored state that can be used; returns the start if there is none.
+    """Reads the newest usable checkpoint; returns the start if there is none.
 
     Args:
         folder: of the checkpoints.
-        rows: of the run, which may have been cut off anywhere.
+        rows: of the run, possibly interrupted anywhere.
         start: the state before the first view; everything but the arrays is taken from it.
     """
     # Newest first: every view after a checkpoint costs one more mapping and decision.
     for step in reversed(checkpoint_steps(folder)):
-        # The trace was cut before it: its map holds views that the run no longer has. Or a path is
-        # under way: it is decided again, from where it begins.
+        # The trace was cut before it: its map contains views that the run no longer has. Or a path
+        # is unfinished: it is decided again from its start.
         if step >= len(rows) or rows[step].captured:
             continue
         try:
             state = state_of(load_checkpoint(folder, step), start)
         except ValueError:
-            continue  # an older one, or the frames, will do
+            continue  # an older one, or the frames, suffice
         row = rows[step]
-        # Exact: JSON and checkpoints hold every float as it is, so any difference is a mismatch.
+        # Exact: JSON and checkpoints store floats exactly, so that any difference is a mismatch.
         if (
             state.views == row.step + 1
             and np.array_equal(np.asarray(state.T_world_camera, np.float32), row.pose)
@@ -231,21 +230,21 @@ def state_of(tables: Tables, like: LoopState) -> LoopState:
 
     Args:
         tables: of a checkpoint.
-        like: a state of the same run, such as its first: what is not an array is taken from it.
+        like: a state of the same run, such as its first, for everything but arrays.
 
     Raises:
-        ValueError: a table or an array is missing or of another kind.
+        ValueError: a table or an array is missing or of another type.
     """
-    # Not `policy`: a policy that remembers nothing has no such table.
+    # Not `policy`: a policy without memory has no such table.
     missing = sorted({"map", "grid", "loop"} - set(tables))
     if missing:
         raise InputError(f"the checkpoint is missing {', '.join(missing)}")
     arrays = dict(tables["map"])
-    # No array of the map, so `fill` would not notice: with other bins the visited bits of a row
-    # stand for other directions.
+    # Not an array of the map, so `fill` would not notice: with other bins the visited bits mean
+    # other directions.
     if int(arrays.pop("num_bins", -1)) != like.map_state.num_bins:
         raise InputError("the checkpoint's map has other direction bins than the run")
-    # Through `fill`, so that totals come back as plain numbers and are summed as before.
+    # With `fill`, so that totals are plain numbers again.
     rest = {name: getattr(like, name) for name in _LOOP}
     planner = replace(
         like.planner,
@@ -263,12 +262,12 @@ def named_arrays(tree: Any) -> dict[str, np.ndarray]:
 
 
 def fill(template: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    """Fills a tree built like `template` with the leaves `arrays`: the inverse of `named_arrays`.
+    """Fills a tree like `template` with the leaves `arrays`: the inverse of `named_arrays`.
 
     Shapes may differ from the template's, as tables grow; types may not.
 
     Args:
-        template: gives the structure, all that is not an array, and the type of each leaf.
+        template: gives the structure, everything but arrays, and the type of each leaf.
         arrays: by path.
 
     Raises:
@@ -276,10 +275,10 @@ def fill(template: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     """
     leaves, structure = jax.tree_util.tree_flatten_with_path(template)
     names = [_name(path) for path, _ in leaves]
-    # One array too many means another version of the policy: its memory would be half understood.
+    # An extra array means another version of the policy, whose memory would be incomplete.
     if set(names) != set(arrays):
         odd = sorted(set(names) ^ set(arrays))
-        raise InputError(f"these arrays are missing or of no use: {', '.join(odd)}")
+        raise InputError(f"these arrays are missing or unexpected: {', '.join(odd)}")
     filled = [
         _like(leaf, arrays[name], name) for name, (_, leaf) in zip(names, leaves, strict=True)
     ]
@@ -291,9 +290,9 @@ def _name(path: tuple[Any, ...]) -> str:
 
 
 def _like(leaf: Any, array: np.ndarray, name: str) -> Any:
-    """Converts the array to the kind of the leaf: a device array, NumPy, or a number."""
+    """Converts the array to the type of the leaf: a device array, NumPy, or a number."""
     wanted = np.asarray(leaf)
-    # Sizes may differ, as tables double; a type or an axis may not, as compiled code rests on them.
+    # Sizes may differ, as tables double; types and axes may not, as compiled code depends on them.
     if array.dtype != wanted.dtype or array.ndim != wanted.ndim:
         raise InputError(
             f"{name} is {array.dtype} with {array.ndim} axes, expected {wanted.dtype} with "
@@ -303,5 +302,5 @@ def _like(leaf: Any, array: np.ndarray, name: str) -> Any:
         return jnp.asarray(array)
     if isinstance(leaf, np.ndarray | np.generic):
         return array
-    # A Python number: as an array it would be traced where the loop wants a plain value.
+    # A Python number: as an array it would be traced where the loop needs a plain value.
     return type(leaf)(array.item())

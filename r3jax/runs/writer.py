@@ -44,7 +44,7 @@ from r3jax.validation.files import read_bytes
 from r3jax.validation.json_text import sealed
 
 _MAX_IMAGE_BYTES = 256 << 20
-"""No encoded image of a run comes near it."""
+"""Maximum size of an encoded image."""
 
 # Measured at 512x512: level 2 takes 17 ms and a third of the bytes of level 0 (17 ms); level 6
 # saves another tenth and takes 60 ms.
@@ -52,9 +52,9 @@ _PNG_LEVEL = 2
 
 _ROOM = ".room"
 _ROOM_BYTES = 64 << 10
-"""Kept free while a run is written, so that a full disk has room for the row that says so."""
+"""Space reserved while a run is written, so that a full disk has space for the final row."""
 
-# By name, never a whole tree: what users put into a run survives `overwrite`.
+# By name, never a whole tree: users' files in a run survive `overwrite`.
 _OWN = (
     "trace.jsonl",
     "timings.jsonl",
@@ -74,26 +74,26 @@ _OWN = (
     "exports/points.ply",
     *("frames", "checkpoints", "report", "models", "exports"),
 )
-"""Everything in a run that this package makes, but run.json, the lock, checkpoints and models."""
+"""Everything that this package writes into a run, except run.json, the lock, checkpoints and
+models."""
 
 _OF_MODEL = (
     *("scene.ply", "points.ply", "history.csv", "train.json", "lock", "checkpoints"),
     *("checkpoints/training.json", "checkpoints/lock"),
 )
-"""The same of a model, but its checkpoints."""
+"""The same for a model, except its checkpoints."""
 
 
 class RunWriter:
-    """The one writer of a run folder. A context manager: leaving it frees the lock."""
+    """Writes a run folder, exclusively. A context manager that holds the folder's lock."""
 
     def __init__(self, path: Path, header: RunHeader, *, overwrite: bool = False):
         """Makes the folder and writes run.json.
 
         Args:
             path: the run folder, `runs/NAME`.
-            header: what fixes the run.
-            overwrite: delete the run that is there. A folder that holds anything but a run is
-                never deleted.
+            header: of the run.
+            overwrite: delete an existing run. A folder that is not a run is never deleted.
 
         Raises:
             RunError: the folder exists and may not be overwritten, is not a run, is being
@@ -101,7 +101,7 @@ class RunWriter:
         """
         self.path = Path(path)
         with _named(self.path, "cannot make the run folder"):
-            _check_free(self.path, overwrite=overwrite)  # nothing is written where no run may be
+            _check_free(self.path, overwrite=overwrite)  # nothing is written if no run may be there
             own_folder(self.path, "run")
             with self._locked():
                 _check_free(self.path, overwrite=overwrite)  # another process may have been faster
@@ -109,7 +109,7 @@ class RunWriter:
                 for name in ("frames", "report"):
                     make_folder(self.path / name)
                 write_atomic(self.path / "trace.jsonl", b"")
-                # The last: a folder with a run.json can be gone on with.
+                # Last: a folder with a run.json can be resumed.
                 write_atomic(self.path / "run.json", header_to_json(header).encode())
                 self._checkpoints = CheckpointWriter(self.path / "checkpoints")
                 self._begin(header, views=0)
@@ -118,41 +118,45 @@ class RunWriter:
     def resume(cls, path: Path | str, header: RunHeader | None = None) -> tuple["RunWriter", Run]:
         """Goes on with a run that was cut off, interrupted or finished.
 
-        What the killed process left half written is cleared away: the torn end of the trace, and
-        files under temporary names. The row that says how the run ended moves to history.jsonl.
+        Partial writes of a killed process are removed: an incomplete last line of the trace, and
+        temporary files. The row about the end of the run moves to history.jsonl.
 
         Args:
             path: the run folder.
-            header: replaces run.json, to give the run another budget; None keeps it.
+            header: replaces run.json, for example with another budget; None keeps it.
 
         Returns:
-            The writer, and the run as it was recorded so far.
+            The writer, and the run recorded so far.
 
         Raises:
             RunError: not a run, damaged, being written by another process, or not writable.
         """
-        # Not by `__init__`, which would clear the run away.
+        # Not by `__init__`, which would delete the run.
         writer = cls.__new__(cls)
         writer.path = Path(path)
-        read_header(writer.path / "run.json")  # says what is wrong before anything is touched
+        read_header(writer.path / "run.json")  # reports errors before anything is changed
         with _named(writer.path, "cannot go on with the run"), writer._locked():
             # Read under the lock: until now another process may have added views.
             run = read_run(writer.path)
             own_folder(writer.path, "run")
-            for name in ("frames", "report", "exports"):  # refused now, not after an hour
+            for name in (
+                "frames",
+                "report",
+                "exports",
+            ):  # refused now, not after an hour of exploration
                 make_folder(writer.path / name)
             writer._checkpoints = CheckpointWriter(writer.path / "checkpoints")
-            _mend(writer.path)  # after the read, which refuses a trace that cannot be mended
+            _mend(writer.path)  # after reading, which refuses a trace beyond repair
             if header is not None:
                 write_atomic(writer.path / "run.json", header_to_json(header).encode())
             writer._begin(header or run.header, views=len(run.rows))
-        # It has not ended any more.
+        # The run has not ended any more.
         return writer, replace(run, header=header or run.header, end=None)
 
     @contextlib.contextmanager
     def _locked(self):
-        """Takes the lock, and keeps it unless the block fails."""
-        # The lock is kept beyond this block, by the writer; only a failure in it gives it back.
+        """Acquires the lock, and keeps it unless the block fails."""
+        # The writer holds the lock beyond this block; only a failure releases it.
         try:
             self._lock = lock_folder(self.path)
         except BlockingIOError:
@@ -172,38 +176,41 @@ class RunWriter:
             "budget": header.budget,
             "packages": package_versions(),
         }
-        # The time of day is here and nowhere else: equal runs shall write equal traces.
+        # The time of day is only here, so that equal runs write equal traces.
         append_line(self.path / "history.jsonl", json.dumps(begin))
-        # No zeros: some file systems store them in no room at all.
+        # No zeros: some file systems store them without using space.
         write_atomic(self.path / _ROOM, os.urandom(_ROOM_BYTES))
 
     def add(self, row: StepRow, frame: Frame) -> None:
         """Stores one view: the images first, then the row, so that a row's images exist.
 
         Args:
-            row: what the trace says of the view.
+            row: its row in the trace.
+
             frame: its frame, in stored form.
 
         Raises:
             RecordingStopped: the disk refused; the views before stay readable.
         """
         rgb, depth = to_integers(frame)
-        # Beside each other: the compressor lets other threads run, and the loop waits for both.
+        # In parallel: compression releases the lock of Python, and the loop waits for both.
         with ThreadPoolExecutor(1) as other:
             depth_png = other.submit(encode_png, depth)
             self._store(row, encode_png(rgb), depth_png.result())
 
     def adopt(self, row: StepRow, run: Run, step: int) -> None:
-        """Stores a view of another run as the next one of this run; its pixels stay as they are.
+        """Stores a view of another run as the next one of this run, with the same pixels.
 
         Args:
-            row: what the trace says of it here.
-            run: where its images lie.
+            row: its row in this trace.
+
+            run: the other run.
+
             step: its number there.
 
         Raises:
             RunError: an image cannot be read.
-            RecordingStopped: the disk refused.
+            RecordingStopped: writing failed.
         """
         try:
             rgb, depth = (
@@ -215,20 +222,20 @@ class RunWriter:
         self._store(row, rgb, depth)
 
     def _store(self, row: StepRow, rgb_png: bytes, depth_png: bytes) -> None:
-        # Images, then their names, then the row: whatever moment the power fails at, every row
-        # that is there has its images.
+        # Images, then their names, then the row: even after a power failure every row has its
+        # images.
         stem = self.path / "frames" / f"{row.step:06d}"
         with self._guarded():
             write_atomic(stem.with_suffix(".png"), rgb_png)
             write_atomic(stem.with_suffix(".depth.png"), depth_png)
             sync_folder(stem.parent)
             append_line(self.path / "trace.jsonl", to_json(row))
-            # Counted last: the end row must not count a view whose row the disk refused.
+            # Counted last: the end row must not count a view whose row could not be written.
             self.views += 1
 
     def add_timings(self, step: int, stages: dict[str, float]) -> None:
-        """Stores what the stages of one view really took [s], outside the mission clock too."""
-        # In a file of its own, and rounded to microseconds: it differs from run to run.
+        """Stores the measured times of all stages of one view [s]."""
+        # In a separate file, and rounded to microseconds: times differ between runs.
         line = sealed({"step": step, **{k: round(v, 6) for k, v in stages.items()}})
         with self._guarded():
             append_line(self.path / "timings.jsonl", json.dumps(line))
@@ -236,35 +243,35 @@ class RunWriter:
     def checkpoint(self, step: int, tables: Tables, *, wait: bool = False) -> None:
         """Stores the state after view `step` (`stored_states.state_tables`) in the background.
 
-        It is skipped if the state before is still being stored, unless `wait` is True.
+        It is skipped if the previous state is still being stored, unless `wait` is True.
 
         Raises:
-            RecordingStopped: the disk refused the checkpoint before, or with `wait` this one.
+            RecordingStopped: writing the previous checkpoint, or with `wait` this one, failed.
         """
         with self._guarded():
             self._checkpoints.save(step, tables, wait=wait)
 
     def finish(self, outcome: str, message: str) -> None:
-        """Stores how the run ended, on a full disk in the room that was kept for it.
+        """Stores how the run ended, on a full disk in the reserved space.
 
         Raises:
-            RecordingStopped: the disk refused this, or a checkpoint that was under way.
+            RecordingStopped: writing this, or a checkpoint in progress, failed.
         """
         with self._guarded(), contextlib.ExitStack() as afterwards:
-            # Also if the row fails: a checkpoint that is under way is told of, and not dropped.
+            # Also if the row fails: errors of a checkpoint in progress are reported.
             afterwards.callback(self._checkpoints.wait)
-            # Freed first: on a full disk this room is all there is for the row.
+            # Freed first: on a full disk this is the only space for the row.
             remove(self.path / _ROOM)
             append_line(self.path / "trace.jsonl", to_json(EndRow(outcome, message, self.views)))
 
     def record_view(self, view: TakenView, state: LoopState, config: ExplorationConfig) -> None:
-        """Stores one view, and begins to store the state after it.
+        """Stores one view, and starts storing the state after it.
 
         Raises:
             RecordingStopped: the disk refused; the views before stay readable.
         """
         begin = time.perf_counter()
-        # The view first: a resume ignores a checkpoint that has no row, and can do without one.
+        # The view first: when resuming, a checkpoint without a row is ignored.
         self.add(view.row, view.frame)
         if not view.row.captured and state.chosen % config.checkpoint_every == 0:
             self.checkpoint(view.row.step, state_tables(state))
@@ -272,24 +279,25 @@ class RunWriter:
         self.add_timings(view.row.step, view.stages | {"record": seconds})
 
     def record_end(self, state: LoopState, stop: Stop) -> Stop:
-        """Stores the last state and how the run ended; a full disk may refuse even that.
+        """Stores the last state and how the run ended; on a full disk even that may fail.
 
         Returns:
-            The end, with what could not be stored in its message.
+            The end, with failures added to its message.
         """
         try:
             if state.views > 0:
-                # Before the end row, whose message can then say that this map is missing.
+                # Before the end row, so that its message can mention a missing map.
                 self.checkpoint(state.views - 1, state_tables(state), wait=True)
-        except RecordingStopped as error:  # the frames stay, and the map can be made of them again
-            # The full disk that ended the run is not reported twice.
+        except (
+            RecordingStopped
+        ) as error:  # the map can be rebuilt from the frames; a full disk is not reported twice
             if error.reason not in stop.message:
                 message = f"{stop.message}; the last map is not stored ({error.reason})"
                 stop = replace(stop, message=message)
         try:
             self.finish(stop.reason.value, stop.message)
         except RecordingStopped as error:
-            # For the caller only: on the disk the run looks cut off, and can be resumed.
+            # For the caller only: on disk the run looks interrupted, and can be resumed.
             return replace(
                 stop, message=f"{stop.message}; the end is not recorded ({error.reason})"
             )
@@ -309,9 +317,9 @@ class RunWriter:
     def close(self) -> None:
         """Frees the threads and the lock."""
         try:
-            # Before the lock goes: a thread that still writes would meet the next process.
+            # Before releasing the lock, so that no thread still writes for the next process.
             self._checkpoints.close()
-            # A disk that has become read-only refuses this; the run is complete nevertheless.
+            # Fails on a disk that has become read-only; the run is complete anyway.
             with contextlib.suppress(OSError):
                 remove(self.path / _ROOM)
         finally:
@@ -322,13 +330,13 @@ class RunWriter:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Frees the lock, whatever happened."""
+        """Releases the lock in any case."""
         self.close()
 
 
 @contextlib.contextmanager
 def _named(path: Path, what: str) -> Generator[None]:
-    """Says of a run what the system refuses."""
+    """Converts errors of the system to a `RunError` of the run."""
     try:
         yield
     except NotOursError as error:
@@ -339,7 +347,7 @@ def _named(path: Path, what: str) -> Generator[None]:
 
 def encode_png(image: np.ndarray) -> bytes:
     """Encodes an image, [H, W, 3] uint8 or [H, W] uint16, as PNG."""
-    from PIL import Image  # a run is read without images more often than with them
+    from PIL import Image  # lazy: runs are mostly read without images
 
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, format="png", compress_level=_PNG_LEVEL)
@@ -347,20 +355,20 @@ def encode_png(image: np.ndarray) -> bytes:
 
 
 def _mend(path: Path) -> None:
-    """Leaves the whole rows of views in the trace, and nothing half written anywhere."""
+    """Keeps the complete rows of views in the trace, and removes partial writes."""
     trace = path / "trace.jsonl"
     views: list[str] = []
     for line in complete_lines(trace):
         if isinstance(from_json(line), StepRow):
             views.append(line)
         else:
-            # How the run ended before is kept: the trace holds one end, and only as its last row.
+            # The earlier end is moved: a trace has one end, as its last row.
             append_line(path / "history.jsonl", line)
-    # A trace that is whole is not touched.
+    # A complete trace is not changed.
     whole = "".join(f"{line}\n" for line in views).encode()
     if trace.read_bytes() != whole:
         write_atomic(trace, whole)
-    # Only its torn end: the next line would be glued to it, and both would be lost.
+    # Only its incomplete last line, which would be joined with the next one.
     timings = path / "timings.jsonl"
     if timings.exists() and not timings.read_bytes().endswith(b"\n"):
         write_atomic(timings, "".join(f"{line}\n" for line in complete_lines(timings)).encode())
@@ -368,7 +376,7 @@ def _mend(path: Path) -> None:
 
 
 def _check_free(path: Path, *, overwrite: bool) -> None:
-    """Says why no new run may begin here.
+    """Refuses a folder in which no new run may begin.
 
     Raises:
         RunError: a file, something that is not a run, or a run that may not be overwritten.
@@ -381,7 +389,7 @@ def _check_free(path: Path, *, overwrite: bool) -> None:
 
 
 def _clear(path: Path) -> None:
-    """Deletes the run that is there, but for run.json, which the new one replaces."""
+    """Deletes an existing run, except run.json, which the new one replaces."""
     for old in numbered(path / "checkpoints"):
         discard(old)
     models = path / "models"
