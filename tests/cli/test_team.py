@@ -108,7 +108,7 @@ def test_what_cannot_fly_is_refused(room, tmp_path, capsys, words, message):
 @pytest.mark.parametrize(
     ("command", "message"),
     [
-        (["explore", "--resume", "{pair}/0"], "flew in a team: go on with `r3jax team --resume"),
+        (["explore", "--resume", "{pair}/0"], "`r3jax team --resume"),
         (["merge", "{pair}/0", "{pair}/1"], "its camera is not that of"),
         (["team", "--resume", "{pair}", "--seed", "1"], "leave them out: --seed"),
     ],

@@ -129,13 +129,13 @@ def test_a_member_of_a_team_that_was_cut_off_says_so(tmp_path, whole):
     shutil.copytree(source, tmp_path / "team")
     trace = tmp_path / "team" / "1" / "trace.jsonl"
     trace.write_bytes(b"".join(trace.read_bytes().splitlines(keepends=True)[:VIEWS]))
-    with pytest.raises(RunError, match="cut off before its last meeting: go on with `r3jax team"):
+    with pytest.raises(RunError, match="before its last meeting: .*`r3jax team"):
         differences(read_run(tmp_path / "team" / "0"))
 
 
 def test_decisions_of_a_team_are_not_explained_from_one_run(whole):
     folder, _ = whole("wander")
-    with pytest.raises(RunError, match="flew in a team"):
+    with pytest.raises(RunError, match="part of a team"):
         check_decided_alone(read_run(folder / "0"))
 
 
@@ -146,7 +146,7 @@ def test_decisions_of_a_team_are_not_explained_from_one_run(whole):
         ({"team": []}, "without members"),
         ({"team": ["../elsewhere"]}, "leads out of the folder"),
         ({"meet_every": "often"}, "`parent.meet_every` must be float"),
-        ({"meet_every": -1.0}, "met before it began"),
+        ({"meet_every": -1.0}, "negative interval"),
     ],
 )
 def test_a_header_that_names_no_team_is_refused(tmp_path, whole, change, message):
