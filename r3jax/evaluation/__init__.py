@@ -1,1 +1,1 @@
-"""What a run achieved: metrics, test views and statistics, the evaluation protocol."""
+"""Evaluation: metrics, test views, statistics and the protocol."""

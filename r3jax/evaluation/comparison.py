@@ -1,4 +1,4 @@
-"""Which records of the benchmark may stand side by side, and their scores sorted by method.
+"""Checks which records of the benchmark are comparable, and collects their scores by method.
 
 A record (`Cell`) is one line of `cells.jsonl`: scene x policy x seed at one snapshot of a budget.
 """
@@ -19,7 +19,7 @@ POLICIES = (
     "random", "frontier", "cover", "gavis", "active-gamer", "gauss-mi", "fisherrf", "active-gs",
     "active-gs-online", "r3con", "r3", "r3-pano", "r3-ahead",
 )  # fmt: skip
-"""Order of the lines of tables and of legends: the floor first, ours last, as in the paper."""
+"""Order of rows in tables and legends: baselines first, `r3` and its variants last."""
 
 
 def method_name(cell: Cell) -> str:

@@ -1,4 +1,4 @@
-"""The worst test views at a glance: truth, render, where they differ, what the map expected."""
+"""A contact sheet of the worst test views: truth, render, error, renderability."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -45,7 +45,7 @@ class SheetView:
     """[H, W, 3] uint8."""
 
     renderability: np.ndarray | None = None
-    """R of what each pixel sees, [h, w] in [0, 1] of any resolution; None without a map."""
+    """R of the voxel in each pixel, [h, w] in [0, 1] of any resolution; None without a map."""
 
     beyond: np.ndarray | None = None
     """True where the sensor found nothing within its range, [H, W] of any resolution; None: not

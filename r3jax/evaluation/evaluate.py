@@ -1,4 +1,4 @@
-"""Evaluates a scene of Gaussians by test views: renders each, compares it with the true image.
+"""Evaluates a scene of Gaussians on test views: renders each and compares it with the true image.
 
 Shape symbols: v views; H, W size of every image.
 """
@@ -32,7 +32,7 @@ ImageMetric = Callable[[Float[Array, "b H W 3"], Float[Array, "b H W 3"]], np.nd
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What came out."""
+    """The result of an evaluation."""
 
     rows: tuple[ViewRow, ...]
     """One per view, in their order."""
@@ -52,16 +52,16 @@ def evaluate(
     numbers: Sequence[int] | None = None,
     on_view: Callable[[int], None] | None = None,
 ) -> Evaluation:
-    """Renders every view, rounds it to 8 bits and measures how far it is from the true image.
+    """Renders every view, rounds it to 8 bits and compares it with the true image.
 
     Args:
-        scene: what is evaluated.
+        scene: the scene.
         views: true images with poses, depth and intrinsics, of one size.
         config: the rasterizer; a budget of intersections left open is raised as needed.
         background: RGB behind everything, the one of the training; black by default.
         lpips: the perceptual metric (`lpips.load_lpips`); left out by default.
         renderability: of each view, to stand in its row; see `r3jax.renderability`.
-        numbers: what the views are called in the rows; 0, 1, ... by default.
+        numbers: numbers of the views for the rows; 0, 1, ... by default.
         on_view: called with the number of views rendered so far.
 
     Returns:
@@ -108,7 +108,7 @@ def evaluate(
 
 
 def _check_scene(scene: GaussianScene) -> None:
-    """Refuses parameters that are not finite: rasterizers skip them, and hide the damage."""
+    """Refuses parameters that are not finite, which rasterizers would silently skip."""
     finite = np.ones(scene.capacity, dtype=bool)
     for values in jax.tree.leaves(scene):
         finite &= np.isfinite(np.asarray(values)).reshape(scene.capacity, -1).all(axis=1)

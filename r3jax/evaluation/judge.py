@@ -1,4 +1,4 @@
-"""A model judged by test views: metrics, what the map expected, and the files that keep them."""
+"""Evaluates a model on test views: metrics, renderability, and the output files."""
 
 import dataclasses
 import hashlib
@@ -37,7 +37,7 @@ NETWORKS = {"alex": "AlexNet", "vgg": "VGG16"}
 
 @dataclass(frozen=True)
 class TestSet:
-    """The views that judge."""
+    """The test views."""
 
     capture: Capture
     numbers: list[int]
@@ -47,7 +47,7 @@ class TestSet:
     """As the table calls them."""
 
     num_trained: int | None
-    """How many of them the model has seen; None if not known."""
+    """Number of them that the model was trained on; None if not known."""
 
     def frames(self) -> Iterator[Frame]:
         """Iterates over every frame in order, as recorded."""
@@ -57,7 +57,7 @@ class TestSet:
 def choose_views(
     spec: str, capture: Capture, model: TrainedModel, up: Literal["y", "z"] = "y"
 ) -> TestSet:
-    """Finds the views that judge a model.
+    """Finds the test views of a model.
 
     Args:
         spec: `heldout`, `all`, `every:N`, or the folder of another capture of the place.
@@ -149,7 +149,7 @@ def frames_of(capture: Capture, numbers: list[int]) -> Iterator[Frame]:
 
 @dataclass(frozen=True)
 class JudgeSettings:
-    """How a model is judged."""
+    """Settings of the evaluation of a model."""
 
     lpips: Literal["alex", "vgg", "none"] = "alex"
     """Network of LPIPS; `none` leaves it out."""
@@ -158,7 +158,7 @@ class JudgeSettings:
     """Longer side of the images [px]; None: that of the training."""
 
     with_map: bool = True
-    """The training views are mapped, and the map's expectation is set beside the result."""
+    """Map the training views, and report the renderability of the test views."""
 
     seed: int = 0
     """Seed of the bootstrap."""
@@ -169,7 +169,7 @@ class JudgeSettings:
 
 @dataclass(frozen=True)
 class Judgment:
-    """All that is shown and written of a judged model."""
+    """The result of evaluating a model."""
 
     model: TrainedModel
     test: TestSet
@@ -184,7 +184,7 @@ class Judgment:
 
     @property
     def described(self) -> str:
-        """How many views of what, at which size."""
+        """Number, source and size of the views."""
         size = f"{self.views.width}x{self.views.height} px"
         return f"{len(self.views)} {self.test.title} of {self.test.capture.path} at {size}"
 
@@ -196,7 +196,7 @@ def judge(
     settings: JudgeSettings,
     on_progress: OnProgress,
 ) -> Judgment:
-    """Renders the test views by the model and compares them.
+    """Renders the test views with the model and compares them.
 
     Args:
         capture: what the model was looked up for: its map is made of it.
@@ -352,12 +352,12 @@ def _sheet(judgment: Judgment, worst: int):
 
 
 def warnings_of(judgment: Judgment) -> list[str]:
-    """Says what makes the numbers mean less than they seem to."""
+    """Lists warnings about the validity of the numbers."""
     test, warnings = judgment.test, list[str]()
     if test.num_trained:
         warnings.append(
             f"the model was trained on {test.num_trained} of these {len(test.numbers)} views; "
-            "this says how well it fits, not how well it predicts"
+            "the numbers show its fit, not its prediction"
         )
     if test.num_trained is None:
         warnings.append(
@@ -366,5 +366,5 @@ def warnings_of(judgment: Judgment) -> list[str]:
     trained = judgment.model.record.get("resolution")
     longer = max(judgment.views.width, judgment.views.height)
     if trained is not None and longer != trained:
-        warnings.append(f"the model was trained at {trained} px and is judged at {longer} px")
+        warnings.append(f"the model was trained at {trained} px and is evaluated at {longer} px")
     return warnings

@@ -1,4 +1,4 @@
-"""What a map of the training views expects of test views."""
+"""Renderability of test views on a map of the training views."""
 
 from collections.abc import Iterable
 
@@ -20,11 +20,11 @@ def map_of(
 ) -> MapState:
     """Builds the map of these frames and no others; it grows as needed.
 
-    A run's own map has seen the held-out views too, and would praise what a model trained without
-    them cannot know.
+    A run's own map contains the held-out views, too, and would overestimate a model trained without
+    them.
 
     Args:
-        frames: what the model was trained on.
+        frames: those that the model was trained on.
         voxel_size: edge of a voxel [m].
         max_range: depth beyond it is ignored [m].
         num_bins: direction bins per voxel.

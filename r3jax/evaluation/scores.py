@@ -1,4 +1,4 @@
-"""The numbers of an evaluated scene: one row per view, and what they come to."""
+"""Scores of an evaluated scene: one row per view, and their summary."""
 
 import csv
 import dataclasses
@@ -22,7 +22,7 @@ _RESAMPLES, _RESAMPLES_AT_A_TIME = 4000, 500
 
 @dataclass(frozen=True)
 class ViewRow:
-    """How well one test view was rendered."""
+    """The scores of one test view."""
 
     view: int
     """Number of the view in its data set."""
@@ -58,7 +58,7 @@ class Metric:
     """Field of `ViewRow`."""
 
     title: str
-    """As tables call it."""
+    """Its name in tables."""
 
     decimals: int
     """That tables show."""
@@ -92,7 +92,7 @@ class Summary:
     median: float
 
     percentile_5: float
-    """The value that 5 % of the views are worse than (LPIPS: its 95th percentile)."""
+    """The 5th percentile (LPIPS: the 95th), so that 5 % of the views are worse."""
 
     worst: float
 
@@ -107,8 +107,8 @@ def summarize(rows: Sequence[ViewRow], *, seed: int = 0) -> tuple[Summary, ...]:
     """Computes the mean, bootstrap interval, median and tail of every metric that has values.
 
     The interval is the percentile bootstrap of the mean (Efron 1979): 4000 test sets of the same
-    size are drawn from the views, with replacement. It says how much the choice of the test views
-    matters; seeds of training are another matter.
+    size are drawn from the views, with replacement. It covers the choice of the test views, but not
+    the seeds of training.
 
     Args:
         rows: one per view; NaN and None are left out.

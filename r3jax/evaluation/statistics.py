@@ -27,7 +27,7 @@ the same views in the same order for all methods."""
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number from a sample, and how far the sample lets one trust it."""
+    """An estimate from a sample, with its interval."""
 
     value: float
     """Value of the sample itself; NaN where it is not defined (a constant column, ...)."""
@@ -45,11 +45,11 @@ class Estimate:
 def mean_over_scenes(scores: Scores, *, seed: int = 0, resamples: int = RESAMPLES) -> Estimate:
     """Computes the mean over scenes, seeds and views, with a hierarchical interval.
 
-    Every scene weighs the same, whatever its number of views. A resample draws, in each scene,
-    its seeds and (independently) its views with replacement; all drawn seeds share the
-    same drawn views, as in truth (the pigeonhole bootstrap, Owen 2007, over rows and columns).
-    With few seeds the interval is too narrow for their part: it sees (S - 1) / S of their
-    variance, and none of it with one seed.
+    Every scene weighs the same, whatever its number of views. A resample draws, in each scene, its
+    seeds and (independently) its views with replacement; all drawn seeds share the same drawn
+    views, as in truth (the pigeonhole bootstrap, Owen 2007, over rows and columns). With few seeds
+    the interval is too narrow: it includes (S - 1) / S of the variance of seeds, and none of it
+    with one seed.
 
     Args:
         scores: per scene [S, V]. Views that are NaN for all seeds do not count.
@@ -82,8 +82,8 @@ def paired_difference(
 ) -> Estimate:
     """Computes the first minus second, as `mean_over_scenes` of the differences view by view.
 
-    The same test views evaluate all methods, so what makes a view hard cancels and the interval is
-    far narrower than that of either mean. Seeds are paired row by row.
+    All methods are evaluated on the same test views, so that differences in difficulty cancel and
+    the interval is much narrower than that of either mean. Seeds are paired row by row.
 
     Raises:
         ValueError: other scenes, seeds or views in one than in the other.

@@ -57,7 +57,7 @@ _SEED = 0
 
 @runtime_checkable
 class Truth(Protocol):
-    """What the evaluation protocol asks of a world (`r3jax.simulators.free_space.GroundTruth`)."""
+    """The protocol's interface to a world (`r3jax.simulators.free_space.GroundTruth`)."""
 
     @property
     def scene(self) -> str:
@@ -66,7 +66,7 @@ class Truth(Protocol):
 
     @property
     def scene_hash(self) -> str:
-        """SHA-256 of what the scene shows."""
+        """SHA-256 of the scene's content."""
         ...
 
     def free_positions(self, spacing: Sequence[float | int], margin: float | int) -> np.ndarray:
@@ -90,16 +90,16 @@ class ViewSet:
     """The scene's name."""
 
     scene_hash: str
-    """SHA-256 of what the scene shows: the views mean nothing in another one."""
+    """SHA-256 of the scene's content: the views are only valid in this scene."""
 
     spacing: tuple[float, float, float]
     """Spacing of the lattice [m]."""
 
     margin: float
-    """Least distance to every surface [m]."""
+    """Minimum distance to every surface [m]."""
 
     max_views: int | None
-    """Views at most; None: all of the lattice."""
+    """Maximum number of views; None: all of the lattice."""
 
     positions: np.ndarray
     """Camera center of each view [V, 3] [m] float64, multiples of 0.1 mm."""
@@ -158,7 +158,7 @@ def compute_view_set(
         raise InputError(
             f"{truth.scene}: no test views: of a lattice of {tuple(spacing)} m, "
             f"{len(positions)} points keep {margin} m from every surface and can be reached from "
-            "the start, and from none of them is there something to see; try a finer lattice or "
+            "the start, and none of them sees a surface; try a finer lattice or "
             "a smaller margin"
         )
     x, y, z = (float(side) for side in spacing)
@@ -246,7 +246,7 @@ def read_view_set(path: str | Path) -> ViewSet:
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} is not a set of test views ({error!r:.300}): {_AGAIN}") from error
     if not matches:
-        raise InputError(f"{path} was changed: its content does not give its hash; {_AGAIN}")
+        raise InputError(f"{path} was changed: its content does not match its hash; {_AGAIN}")
     return view_set
 
 

@@ -1,4 +1,4 @@
-"""What a rasterizer backend takes and gives, and which one serves where."""
+"""The interface of rasterizer backends, and the choice among them."""
 
 import importlib.util
 from typing import Protocol, runtime_checkable
@@ -15,7 +15,7 @@ from r3jax.splatting.scene import GaussianScene
 
 
 class Composite(eqx.Module):
-    """What a backend returns: the Gaussians composited on black."""
+    """The result of a backend: the Gaussians composited on black."""
 
     rgb: Float[Array, "H W 3"]
     """Sum of weight x color."""
@@ -27,10 +27,10 @@ class Composite(eqx.Module):
     """Sum of the weights."""
 
     num_intersections: Int[Array, ""]
-    """Pairs of tile and Gaussian that the view needs."""
+    """Number of (tile, Gaussian) pairs of the view."""
 
     overflow: Int[Array, ""]
-    """How many of them were dropped as there was no room in the budget."""
+    """Number of pairs beyond the budget, which were dropped."""
 
 
 @runtime_checkable
@@ -50,9 +50,9 @@ class Rasterize(Protocol):
 
 
 def find_backend(name: str) -> Rasterize:
-    """Finds the backend of a name; `auto` takes the fastest that runs on this machine.
+    """Finds a backend by name; `auto` is the fastest on this machine.
 
-    `numba` becomes `xla`, with a warning, where no kernel runs.
+    `numba` becomes `xla`, with a warning, if kernels cannot run.
 
     Raises:
         ValueError: there is no such backend.

@@ -8,15 +8,15 @@ Backend = Literal["auto", "numba", "xla", "splax", "reference"]
 
 
 class RasterConfig(eqx.Module):
-    """How to rasterize; all of it static: another value recompiles."""
+    """Settings of the rasterizer; static, so that other values recompile."""
 
     backend: Backend = eqx.field(static=True, default="auto")
-    """`numba` on CPUs, `splax` on NVIDIA GPUs where it is installed, `xla` everywhere else;
-    `reference` is the slow oracle of the tests."""
+    """`auto`: `numba` on CPUs, `splax` on NVIDIA GPUs if installed, `xla` elsewhere. `reference` is
+    the slow oracle of the tests."""
 
     max_intersections: int | None = eqx.field(static=True, default=None)
-    """Budget of (tile, Gaussian) pairs. None: 8 a Gaussian, raised by itself outside jit. What
-    does not fit is counted in `Rendering.overflow`, and the images are NaN."""
+    """Budget of (tile, Gaussian) pairs. None: 8 per Gaussian, raised automatically outside jit.
+    Pairs beyond it are counted in `Rendering.overflow`, and the images are NaN."""
 
     tiles_per_batch: int = eqx.field(static=True, default=16)
     """`xla`: tiles composited at a time."""

@@ -1,4 +1,4 @@
-"""What can go wrong with a scene file, with training data and with the machine's memory."""
+"""Errors of scene files, training data and memory."""
 
 from pathlib import Path
 
@@ -6,19 +6,19 @@ from r3jax.errors import InputError, PathError
 
 
 class SceneFileError(PathError):
-    """A file of Gaussians that cannot be read or written; names it and the reason."""
+    """A file of Gaussians cannot be read or written; names it and the reason."""
 
 
 class ViewsError(InputError):
-    """Views that nothing can be trained on; says which and why."""
+    """Views that cannot be used for training; says which and why."""
 
 
 class TooLargeError(InputError):
-    """A training that would not fit in memory; says how much it needs and what would fit."""
+    """A training would not fit in memory; says how much it needs and what would fit."""
 
 
 class CheckpointError(PathError):
-    """A training that cannot go on from what is stored; names the folder and the reason."""
+    """A training cannot be resumed; names the folder and the reason."""
 
 
 class TrainingDiverged(ArithmeticError):

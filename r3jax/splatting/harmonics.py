@@ -39,7 +39,7 @@ def harmonics(
 def view_colors(
     sh: Float[Array, "n k 3"], means: Float[Array, "n 3"], camera_center: Float[Array, " 3"]
 ) -> Float[Array, "3 n"]:
-    """Computes colors of Gaussians as a camera sees them: max(SH(direction) + 0.5, 0).
+    """Computes colors of Gaussians for a camera: max(SH(direction) + 0.5, 0).
 
     Args:
         sh: coefficients, k = (degree + 1)^2.

@@ -1,4 +1,4 @@
-"""The folder of a trained model: its Gaussians, and what it was trained on.
+"""The folder of a trained model: its Gaussians, and the record of its training.
 
 models/NAME/
 scene.ply      the Gaussians
@@ -51,12 +51,12 @@ _KINDS = {
     "test_views": list[int],
     "config": dict[str, Any],
 }
-"""What is used of train.json."""
+"""The fields used of train.json."""
 
 
 @dataclass(frozen=True)
 class TrainedModel:
-    """A model, and what is known of its training."""
+    """A model, and the record of its training."""
 
     path: Path
     """The PLY file."""
@@ -65,7 +65,7 @@ class TrainedModel:
     """The content of train.json; empty if there is none."""
 
     is_here: bool
-    """True if the model was trained on the capture that it was looked up for."""
+    """True if the model was trained on the given capture."""
 
     @property
     def train_views(self) -> list[int] | None:
@@ -74,7 +74,7 @@ class TrainedModel:
 
     @property
     def background(self) -> np.ndarray:
-        """Color behind everything in the training [3]; black if that was random."""
+        """Background color of the training [3]; black if it was random."""
         is_white = self.record.get("config", {}).get("background") == "white"
         return np.full(3, 1.0 if is_white else 0.0, dtype=np.float32)
 
@@ -113,10 +113,7 @@ def find_model(
 
 
 def newest_name(models: Path) -> str | None:
-    """Finds the model that is meant without a name.
-
-    It is `last`, or else the newest, or else None.
-    """
+    """Finds the default model: `last`, else the newest, else None."""
     found = sorted(models.glob("*/scene.ply"), key=lambda path: path.stat().st_mtime)
     names = [path.parent.name for path in found]
     return "last" if "last" in names else next(reversed(names), None)
@@ -140,12 +137,12 @@ def _read_record(path: Path) -> dict[str, Any]:
         if min(record.get(name, ()), default=0) < 0:
             raise ForeignFileError(f"`{name}` holds a negative number")
     if record.get("resolution", 1) < 1 or "\0" in record.get("data", ""):
-        raise ForeignFileError("`resolution` or `data` makes no sense")
+        raise ForeignFileError("`resolution` or `data` is invalid")
     return record
 
 
 def check_free(folder: Path, *, replace: bool) -> None:
-    """Refuses a folder that holds a model, unless it may change, or something that is no model.
+    """Refuses a folder with a model, unless it may be changed, or one that is not a model's.
 
     Raises:
         SceneFileError: a model.
@@ -163,7 +160,7 @@ def check_free(folder: Path, *, replace: bool) -> None:
 
 @contextlib.contextmanager
 def only_writer(folder: Path, *, replace: bool) -> Generator[None]:
-    """Makes the folder, and keeps other processes from training this model meanwhile.
+    """Makes the folder, and locks it against other processes.
 
     Raises:
         SceneFileError: another process is training here, or see `check_free`.
@@ -193,7 +190,7 @@ def write_model(
 
     Args:
         folder: where to.
-        result: what the training gave.
+        result: of the training.
         data: the capture trained on.
         views: the views trained on.
         split: numbers of the views trained on, and of those held out.
@@ -217,7 +214,7 @@ def write_model(
         "packages": packages,
         "history_sha256": hashlib.sha256(history).hexdigest(),
     }
-    # The last: a reader of train.json finds what it speaks of.
+    # Last: the files that train.json describes exist.
     write_atomic(folder / "train.json", json.dumps(sealed(record), indent=1).encode())
 
 
@@ -233,7 +230,7 @@ def _history_csv(history: History) -> bytes:
 
 
 def scene_points(scene: GaussianScene) -> tuple[np.ndarray, np.ndarray]:
-    """Takes centers [m] and mean colors (uint8) of the Gaussians in use, [n, 3] each."""
+    """Returns centers [m] and mean colors (uint8) of the used Gaussians, [n, 3] each."""
     alive = np.asarray(scene.is_alive)
     colors = np.clip(np.asarray(scene.sh)[alive, 0] * SH0 + 0.5, 0.0, 1.0)
     return np.asarray(scene.means)[alive], np.round(255.0 * colors).astype(np.uint8)

@@ -37,13 +37,13 @@ _TYPES = {
 _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 
 _MAX_HEADER_LINES = 10_000
-"""A header longer than this is something else."""
+"""Maximum length of a header [bytes]."""
 
 _BLOCK = 1 << 22
 """Length of a text that is read at once [bytes]."""
 
 _LONGEST_WORD = 400
-"""A number with more digits is something else."""
+"""Maximum length of a number in a text file [characters]."""
 
 _HASH = re.compile(rb"(?<=\n)comment sha256 ([0-9a-f]{64})\n")
 
@@ -56,7 +56,7 @@ _ROTATION = [f"rot_{i}" for i in range(4)]
 
 @dataclass(frozen=True)
 class _Element:
-    """A table inside a PLY file, as its header announces it."""
+    """A table in a PLY file, as declared by its header."""
 
     name: str
     count: int
@@ -69,7 +69,7 @@ class _Element:
 
 @checked(scene=a_scene)
 def write_scene(path: Path | str, scene: GaussianScene) -> None:
-    """Writes the used rows of a scene; reading the file gives the same numbers, bit for bit.
+    """Writes the used rows of a scene; reading the file gives bit-identical numbers.
 
     Binary, little endian, float32: x y z, nx ny nz (zeros), f_dc, f_rest (all of red, then
     green, then blue), opacity (before the sigmoid), scale (logarithms), rot (wxyz). A comment in
@@ -99,7 +99,7 @@ def write_scene(path: Path | str, scene: GaussianScene) -> None:
 
 
 def read_scene(path: Path | str) -> GaussianScene:
-    """Reads a scene that this or another program wrote.
+    """Reads a scene written by r3jax or another program.
 
     Fields may come in any order and number type, with others between them and without normals;
     the file may be binary of either byte order or text, and hold other elements.
@@ -118,7 +118,7 @@ def read_scene(path: Path | str) -> GaussianScene:
             num_rest = _count_rest(path, {name for name, _ in vertex.fields})
             read = _read_text if byte_order == "=" else _read_binary
             table = read(path, file, byte_order, vertex, before)
-            _check_hash(file)  # last: what is wrong with a file says more than that something is
+            _check_hash(file)  # last: the specific errors say more
     except FileNotFoundError:
         raise SceneFileError(path, "the file is missing") from None
     except OSError as error:
@@ -192,7 +192,7 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[str, list[_Element]]:
                 raise InputError
         except (KeyError, IndexError, ValueError):
             raise SceneFileError(
-                path, f"the header has a line that no PLY has: {' '.join(words)[:80]!r}"
+                path, f"the header has an invalid line: {' '.join(words)[:80]!r}"
             ) from None
     raise SceneFileError(path, "the header has no end (no line 'end_header'): is the file cut off?")
 
@@ -297,7 +297,7 @@ def _words(file: BinaryIO) -> Iterator[list[bytes]]:
 def _cut_off(path: Path, promised: int, found: int) -> SceneFileError:
     return SceneFileError(
         path,
-        f"the file is cut off: its header promises {promised} Gaussians, {found} are there; copy "
+        f"truncated: the header declares {promised} Gaussians, the file contains {found}; copy "
         "or export it again",
     )
 
@@ -327,7 +327,7 @@ def _count_rest(path: Path, names: set[str]) -> int:
 
 
 def _check_values(path: Path, names: list[str], table: np.ndarray) -> None:
-    """Refuses what renders to NaN, or to nothing at all."""
+    """Refuses values that render to NaN or to nothing."""
     if len(table) == 0:
         raise SceneFileError(path, "there are no Gaussians to write")
     is_bad = ~np.isfinite(table)

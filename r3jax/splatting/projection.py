@@ -15,7 +15,7 @@ from r3jax.splatting.scene import DEAD_LOGIT, GaussianScene
 
 
 class ProjectedGaussians(eqx.Module):
-    """What compositing needs to know of each Gaussian, for one camera."""
+    """The projection of each Gaussian for one camera."""
 
     center: Float[Array, "2 n"]
     """Column and row [px]."""
@@ -90,9 +90,9 @@ def project_gaussians(
 
 
 def without_nans(scene: GaussianScene) -> GaussianScene:
-    """Puts Gaussians whose shape, place or opacity is not a number out of sight.
+    """Moves Gaussians with NaN shape, position or opacity out of view.
 
-    Not drawing them is not enough: 0 x NaN would spoil the gradient of the pose.
+    Not drawing them is not enough: 0 x NaN would make the gradient of the pose NaN.
     """
     valid = ~jnp.isnan(scene.opacity_logits)
     for x in (scene.means, scene.quats, scene.log_scales):
@@ -162,7 +162,7 @@ def _reach(
     The largest |dx| on the ellipse s = s_max is sqrt(2 s_max cov_xx).
     """
     s_max = jnp.log(jnp.maximum(opacity, ALPHA_MIN) / ALPHA_MIN)
-    # A hair more, so that rounding never cuts off a pixel.
+    # Slightly larger, so that rounding never cuts off a pixel.
     reach = 1e-3 + jnp.sqrt(2.002 * s_max[None, :] * jnp.stack([xx, yy]))
     size = jnp.array([[camera.width], [camera.height]], dtype=jnp.float32)
     inside = ((center + reach > 0.0) & (center - reach < size)).all(axis=0)

@@ -29,7 +29,7 @@ class Rendering(eqx.Module):
     """Pairs of tile and Gaussian that the view needs."""
 
     overflow: Int[Array, ""]
-    """How many of them were dropped; if any, the images are NaN."""
+    """Number of dropped pairs; if there are any, the images are NaN."""
 
 
 @checked(
@@ -51,10 +51,10 @@ def render(
     """Renders one view by EWA splatting (Kerbl et al. 2023).
 
     Differentiable by the scene, the pose, the intrinsics and the background. The budget of
-    intersections is fixed while tracing: where a view needs more, `overflow` counts what was
-    dropped and the images are NaN, because an image with missing Gaussians looks plausible.
-    Outside jit (and if the config leaves the budget open) it is raised until the view fits. A pose
-    that is not rigid is refused outside jit, and gives NaN under it.
+    intersections is fixed while tracing: if a view needs more, `overflow` counts the dropped ones
+    and the images are NaN, because an image without some Gaussians would look plausible. Outside
+    jit (and if the config sets no budget) it is raised until the view fits. A pose that is not
+    rigid is refused outside jit, and gives NaN under it.
 
     Args:
         scene: the Gaussians.
@@ -62,14 +62,14 @@ def render(
         T_world_camera: camera-to-world pose, OpenCV axes [m].
         background: RGB behind everything; black by default.
         config: backend and budget.
-        center_offsets: added to the projected centers [px]; zeros by default. Its gradient is
-            the gradient by the projected centers, which densification asks for.
+        center_offsets: added to the projected centers [px]; zeros by default. Their gradient is
+            that of the projected centers, which densification uses.
 
     Returns:
         Color, expected depth and alpha.
 
     Raises:
-        TypeError: arguments of another kind.
+        TypeError: arguments of another type.
         ValueError: shapes that do not fit together, a pose that is not rigid, or an unknown
             backend.
         ImportError: the backend's packages are not installed.
@@ -91,12 +91,12 @@ def render(
 def _finish(
     composite: Composite, background: Float[Array, " 3"], factor: Float[Array, ""]
 ) -> Rendering:
-    """Puts the background behind, divides depth by alpha, spoils what overflowed.
+    """Adds the background, divides depth by alpha, and sets overflowed images to NaN.
 
     Args:
         composite: the Gaussians.
         background: RGB behind them.
-        factor: 1, or NaN for a view that cannot be meant.
+        factor: 1, or NaN for an invalid view.
     """
     alpha = composite.alpha
     covered = alpha > 0.0

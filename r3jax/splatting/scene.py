@@ -17,7 +17,7 @@ DEAD_LOGIT = -100.0
 class GaussianScene(eqx.Module):
     """3D Gaussians as Kerbl et al. (2023) store them: unconstrained parameters, [n, ...] each.
 
-    A row whose opacity logit is at most half `DEAD_LOGIT` is unused: no camera sees it.
+    Rows with an opacity logit of at most half `DEAD_LOGIT` are unused and invisible.
     """
 
     means: Float[Array, "n 3"]
@@ -38,7 +38,7 @@ class GaussianScene(eqx.Module):
 
     @property
     def capacity(self) -> int:
-        """Rows, used or not."""
+        """Number of rows, used or not."""
         return self.means.shape[0]
 
     @property

@@ -1,1 +1,1 @@
-"""Backends of the rasterizer: the same numbers by different means."""
+"""Backends of the rasterizer, with the same results."""

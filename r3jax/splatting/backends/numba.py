@@ -30,14 +30,14 @@ def rasterize(
     center_offsets: Float[Array, "n 2"],
     config: RasterConfig,
 ) -> Composite:
-    """Composites the scene on black, on as many cores as the process may use.
+    """Composites the scene on black, on all cores that the process may use.
 
-    The same view gives the same bits, images and gradients, on any number of cores. What
-    exceeds the budget is counted in `overflow`; the image is black then, its gradient 0. A
-    Gaussian with a parameter that is not a number is not drawn and gets gradient 0.
+    Images and gradients are bit-identical for any number of cores. Pairs beyond the budget are
+    counted in `overflow`; the image is then black, and its gradient 0. Gaussians with NaN
+    parameters are not drawn and have gradient 0.
 
     Raises:
-        RuntimeError: Numba has no threading layer that serves two renderings at once.
+        RuntimeError: Numba has no threading layer for parallel renderings.
     """
     images, totals = _composited(*arguments(scene, camera, T_world_camera, center_offsets, config))
     return Composite(

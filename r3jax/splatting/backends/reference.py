@@ -1,4 +1,7 @@
-"""The readable rasterizer: every pixel meets every Gaussian. The oracle of all backends."""
+"""The reference rasterizer: evaluates every Gaussian at every pixel.
+
+The oracle for all backends.
+"""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Which Gaussians meet which tile of the image, from near to far.
+"""Lists the Gaussians that touch each tile of the image, from near to far.
 
 XLA on a CPU sorts one array of integers seven times faster than an array with a payload. So every
 sort here is of one array, with the payload in the low bits of the key.
@@ -35,7 +35,7 @@ class TileLists(eqx.Module):
     """How many they are."""
 
     num_intersections: Int[Array, ""]
-    """Pairs of tile and Gaussian, whether they found room or not."""
+    """Number of (tile, Gaussian) pairs, including dropped ones."""
 
     overflow: Int[Array, ""]
     """Dropped pairs: those of the farthest Gaussians."""

@@ -1,1 +1,1 @@
-"""Training of a scene of Gaussians: where it starts, its steps, its state on disk."""
+"""Training of a scene of Gaussians: initialization, steps, checkpoints."""

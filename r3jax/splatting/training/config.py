@@ -13,7 +13,7 @@ from r3jax.splatting.config import RasterConfig
 
 
 class Schedule(NamedTuple):
-    """When what happens; the numbers of one run, all known."""
+    """The schedule of a training, with all numbers resolved."""
 
     sh_every: int
     """Iterations between two degrees of the harmonics."""
@@ -41,7 +41,7 @@ class Schedule(NamedTuple):
 
 
 class TrainConfig(eqx.Module):
-    """How a scene is fitted to views."""
+    """Settings of a training."""
 
     iterations: int = 30_000
     """Steps of the optimizer."""
@@ -51,34 +51,34 @@ class TrainConfig(eqx.Module):
     within a fixed budget (Kheradmand et al. 2024)."""
 
     num_gaussians: int = eqx.field(static=True, default=20_000)
-    """Gaussians at the start."""
+    """Initial number of Gaussians."""
 
     capacity: int | None = eqx.field(static=True, default=None)
-    """Rows, of which the strategies use as many as they need. None: twice `num_gaussians`."""
+    """Maximum number of Gaussians. None: twice `num_gaussians`."""
 
     sh_degree: int = eqx.field(static=True, default=3)
     """Highest degree of the harmonics, 0 to 3."""
 
     views_per_step: int = eqx.field(static=True, default=1)
-    """Views whose losses are averaged for one step."""
+    """Batch size: views per step."""
 
     background: str = eqx.field(static=True, default="black")
-    """Behind everything; `random` draws a new color each step."""
+    """Background color; `random` draws a new color each step."""
 
     raster: RasterConfig = RasterConfig()
-    """Backend, and the first budget of intersections: training raises it as needed."""
+    """Backend, and the initial budget of intersections, which training raises as needed."""
 
     seed: int = 0
-    """Seed of the order of the views, the noise and the random background."""
+    """Random seed of the order of views, the noise and the background."""
 
     lambda_dssim: float = eqx.field(default=0.2, converter=float)
-    """Weight of 1 - SSIM; the mean absolute error has the rest."""
+    """Weight of 1 - SSIM; the rest is the mean absolute error."""
 
     rate_means: float = eqx.field(default=1.6e-4, converter=float)
-    """Learning rate of the centers at the start [scene extents]."""
+    """Initial learning rate of the centers [scene extents]."""
 
     rate_means_last: float = eqx.field(default=1.6e-6, converter=float)
-    """The same at the last iteration; in between it decays exponentially."""
+    """Final learning rate of the centers, reached by exponential decay."""
 
     rate_quats: float = eqx.field(default=1e-3, converter=float)
     """Learning rate of the rotations."""
@@ -97,30 +97,30 @@ class TrainConfig(eqx.Module):
     run."""
 
     refine_from: int | None = eqx.field(static=True, default=None)
-    """Refine after this iteration only. None: 500, but at most a tenth of the run."""
+    """First iteration after which to refine. None: 500, but at most a tenth of the run."""
 
     refine_until: int | None = eqx.field(static=True, default=None)
-    """Refine before this iteration only. None: 15000 (`mcmc`: 25000), but at most half (five
+    """Iteration at which refinement ends. None: 15000 (`mcmc`: 25000), but at most half (five
     sixths) of the run."""
 
     refine_every: int = eqx.field(static=True, default=100)
     """Iterations between two refinements."""
 
     reset_every: int = eqx.field(static=True, default=3000)
-    """Iterations between two resets of the opacities. Not squeezed: opacities need some hundred
-    steps to recover, so a run under 6000 iterations has none."""
+    """Iterations between two resets of the opacities. Not scaled with the run: opacities need some
+    hundred steps to recover, so runs under 6000 iterations have none."""
 
     gradient_threshold: float = eqx.field(default=2e-4, converter=float)
     """Clone or split above this mean gradient by the center [per half image]."""
 
     percent_dense: float = eqx.field(default=0.01, converter=float)
-    """Split what is larger than this, clone what is smaller [scene extents]."""
+    """Split larger Gaussians, clone smaller ones [scene extents]."""
 
     prune_opacity: float = eqx.field(default=0.005, converter=float)
-    """Prune (`mcmc`: relocate) what is less opaque."""
+    """Prune (`mcmc`: relocate) less opaque Gaussians."""
 
     prune_size: float = eqx.field(default=0.1, converter=float)
-    """After the first reset, prune what is larger [scene extents]."""
+    """Prune larger Gaussians after the first reset [scene extents]."""
 
     reset_opacity: float = eqx.field(default=0.01, converter=float)
     """A reset lowers opacities to this."""
@@ -138,7 +138,7 @@ class TrainConfig(eqx.Module):
     """`mcmc`: weight of the mean scale in the loss."""
 
     def __check_init__(self) -> None:
-        """Refuses what cannot work."""
+        """Refuses invalid settings."""
         for name in ("iterations", "num_gaussians", "views_per_step", "refine_every"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")

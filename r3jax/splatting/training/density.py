@@ -1,7 +1,7 @@
 """Adaptive density control of Kerbl et al. (2023, section 5.2) at fixed capacity.
 
-Every decision is a mask over all rows. What is born goes into unused rows; where these run out,
-the Gaussians with the largest gradients are served first and the rest is counted.
+Every decision is a mask over all rows. New Gaussians go into unused rows; if there are too few,
+those with the largest gradients come first and the rest is counted.
 """
 
 from collections.abc import Callable
@@ -22,13 +22,13 @@ SHRINK = 1.6
 
 
 class DensityStatistics(eqx.Module):
-    """How strongly the images pull at each Gaussian's center, since the last refinement."""
+    """Gradients at each Gaussian's center since the last refinement."""
 
     gradient: Float[Array, " n"]
     """Sum of the lengths of the gradients by the projected center [per half image]."""
 
     count: Float[Array, " n"]
-    """Views that saw the Gaussian."""
+    """Number of views that saw the Gaussian."""
 
     @property
     def mean_gradient(self) -> Float[Array, " n"]:
@@ -37,16 +37,16 @@ class DensityStatistics(eqx.Module):
 
 
 class Refinement(NamedTuple):
-    """What one refinement did."""
+    """The result of a refinement."""
 
     born: Int[Array, ""]
-    """Rows that were put in use."""
+    """Number of new Gaussians."""
 
     pruned: Int[Array, ""]
-    """Rows that were given up."""
+    """Number of pruned Gaussians."""
 
     dropped: Int[Array, ""]
-    """Gaussians that wanted to be cloned or split and found no unused row."""
+    """Number of Gaussians to clone or split for which there was no free row."""
 
 
 def empty_statistics(capacity: int) -> DensityStatistics:
@@ -104,7 +104,7 @@ def refine(
         key: of the positions of split children.
 
     Returns:
-        The scene and the moments after; all rows that take no part are untouched.
+        The scene and the moments after; all other rows are unchanged.
     """
     size = jnp.exp(jnp.max(scene.log_scales, axis=1))
     is_pulled = scene.is_alive & (statistics.mean_gradient >= config.gradient_threshold)
@@ -145,7 +145,7 @@ def _pruned(
 def pair_rows(
     wants: Bool[Array, " n"], free: Bool[Array, " n"], priority: Float[Array, " n"]
 ) -> tuple[Int[Array, " n"], Int[Array, " n"], Bool[Array, " n"]]:
-    """Gives each row that wants one a free row, those of high priority first.
+    """Assigns free rows to the requesting rows, those of high priority first.
 
     Returns:
         Row of the k-th parent, row of its child, and whether the pair is real; pairs that are
@@ -193,7 +193,7 @@ def rotated(quats: Float[Array, "n 4"], vectors: Float[Array, "n 3"]) -> Float[A
 def reset_opacities(
     scene: GaussianScene, moments: Moments, config: TrainConfig
 ) -> tuple[GaussianScene, Moments]:
-    """Lowers all opacities to at most `config.reset_opacity` and forgets their moments."""
+    """Lowers all opacities to at most `config.reset_opacity` and resets their moments."""
     limit = jnp.log(config.reset_opacity / (1.0 - jnp.asarray(config.reset_opacity)))
     logits = jnp.minimum(scene.opacity_logits, limit)
     scene = eqx.tree_at(lambda s: s.opacity_logits, scene, logits)

@@ -1,4 +1,4 @@
-"""Training on views that join while it goes on: other views, and Gaussians for what they show.
+"""Training on a growing set of views, with new Gaussians for the surfaces that they show.
 
 Shape symbols: n rows of the scene; m newborn Gaussians.
 """
@@ -19,7 +19,7 @@ from r3jax.splatting.views import Views
 
 
 class Addition(NamedTuple):
-    """What a training goes on with."""
+    """Views and Gaussians to continue with."""
 
     views: Views
     """Keeps the number and the size of those before: another number would recompile the step."""
@@ -29,18 +29,18 @@ class Addition(NamedTuple):
 
 
 class Growth(NamedTuple):
-    """When a training asks for more."""
+    """When to add views."""
 
     every: int
     """Steps between two additions."""
 
     add: Callable[[int, GaussianScene], Addition]
-    """Told the steps done and the scene as it is; it must not keep the scene, whose buffers the
-    next step gives away."""
+    """Called with the number of steps and the scene, which must not be stored: the next step
+    donates its buffers."""
 
 
 def with_newborn(state: TrainState, newborn: GaussianScene) -> TrainState:
-    """Puts Gaussians into unused rows, without moments; those that find none are counted."""
+    """Adds Gaussians in unused rows, without moments; those without a free row are counted."""
     is_born = np.asarray(newborn.is_alive)
     free = np.flatnonzero(~np.asarray(state.scene.is_alive))
     # Past the end where there is no room, and for rows that are not in use: dropped.

@@ -1,4 +1,4 @@
-"""The Gaussians that training starts from: the recorded depth as a thinned cloud of points.
+"""Initializes the Gaussians from a thinned point cloud of the recorded depth.
 
 NumPy on the host: it runs once, sizes are not known beforehand, and float64 costs nothing here.
 
@@ -34,7 +34,7 @@ _FINEST_VOXEL = 1e-3
 """Voxels are not made smaller than this [m]."""
 
 _SCALE_LIMITS = (0.2, 5.0)
-"""Scales stay within these multiples of their median, so that no stray point becomes a fog."""
+"""Scales stay within these multiples of their median, so that outliers do not become fog."""
 
 
 def initialize(

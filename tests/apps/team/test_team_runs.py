@@ -129,7 +129,7 @@ def test_a_member_of_a_team_that_was_cut_off_says_so(tmp_path, whole):
     shutil.copytree(source, tmp_path / "team")
     trace = tmp_path / "team" / "1" / "trace.jsonl"
     trace.write_bytes(b"".join(trace.read_bytes().splitlines(keepends=True)[:VIEWS]))
-    with pytest.raises(RunError, match="before its last meeting: .*`r3jax team"):
+    with pytest.raises(RunError, match=r"before its last meeting: .*`r3jax team"):
         differences(read_run(tmp_path / "team" / "0"))
 
 
