@@ -74,7 +74,7 @@ def read_camera_path(path: Path) -> CameraPath:
         check_fields("camera path", content, {"camera_path": list[dict[str, Any]], **kinds})
         kind = content.get("camera_type", "perspective")
         if kind != "perspective":
-            raise ForeignFileError(f"only perspective paths are read, this is {kind!r:.40}")
+            raise ForeignFileError(f"only perspective paths are supported, this is {kind!r:.40}")
         entries: list[dict[str, Any]] = content["camera_path"]
         if not entries:
             raise ForeignFileError("it holds no cameras")
@@ -207,6 +207,6 @@ def path_of(path: Path, capture: object = None) -> CameraPath:
     if isinstance(source, PosedImages):
         return CameraPath(source.poses, source.lenses)
     if not source.rows:
-        raise FormatError(path, "the run has no views yet: there is no path to judge")
+        raise FormatError(path, "the run has no views yet: no path to evaluate")
     poses = np.stack([row.pose for row in source.rows]).astype(np.float64)
     return CameraPath(poses, (pinhole_lens(source.camera),) * len(poses))

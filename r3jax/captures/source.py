@@ -163,7 +163,7 @@ def distorted(lens: Lens, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.
         return x * factor, y * factor
     if lens.model not in _RADIAL:
         raise ForeignFileError(
-            f"images of a {lens.model} lens are not straightened here: undistort the capture "
+            f"images of a {lens.model} lens cannot be undistorted here: undistort the capture "
             "first, for example by COLMAP's image_undistorter"
         )
     upper = 1.0 + squared * (value("k1") + squared * (value("k2") + squared * value("k3")))
@@ -426,8 +426,8 @@ def _of_images(images: PosedImages, name: str) -> Source:
     remark = images.remark
     if not has_images:
         none = (
-            f"None of the {len(images)} pictures is there (the first should be "
-            f"{images.image_paths[0]}): nothing is said of their sharpness, light or colors."
+            f"None of the {len(images)} pictures was found (the first should be "
+            f"{images.image_paths[0]}): their sharpness, exposure and colors are not known."
         )
         remark = none if remark is None else f"{none} {remark}"
     if hidden := _hidden_share(images) if has_images else 0.0:

@@ -77,12 +77,12 @@ def with_surfaces(
         if why is None:
             return found
     if wanted == "sweep":
-        raise InputError(f"{source.name}: no depth can be swept from its photos: {why}")
+        raise InputError(f"{source.name}: no depth can be computed from its photos: {why}")
     return source if source.reconstruction is None else _remarked(source, why)
 
 
 def _remarked(source: Source, why: str) -> Source:
-    said = f"No depth could be swept from the photos ({why}): only points are judged."
+    said = f"No depth could be computed from the photos ({why}): only points are evaluated."
     return dataclasses.replace(source, remark=f"{source.remark} {said}" if source.remark else said)
 
 
@@ -92,7 +92,7 @@ def _why_not_swept(source: Source) -> str | None:
     if source.is_dense:
         return "it has depth images already"
     if len(source) < _FEWEST_PHOTOS:
-        return f"it takes {_FEWEST_PHOTOS} pictures, here are {len(source)}"
+        return f"at least {_FEWEST_PHOTOS} pictures are needed, found {len(source)}"
     return None
 
 

@@ -123,7 +123,7 @@ def open_capture(path: Path, up: Literal["y", "z"] = "y", topics: Topics | None 
     """
     if topics is not None:
         if not is_bag(path):
-            raise FormatError(path, "topics were named, but this is no ROS bag")
+            raise FormatError(path, "--topics was given, but this is not a ROS bag")
         return Capture(path, read_bag(path, topics))
     if path.is_file() and path.suffix == ".json":
         return Capture(path, read_transforms(path).fitted())
@@ -148,7 +148,7 @@ def _below(path: Path) -> str | None:
     if not found:
         return None
     many = f" (and {len(found) - 1} more)" if found[1:] else ""
-    return f"this is no capture itself, but {found[0]} is one{many}: give that folder"
+    return f"this is not a capture, but {found[0]} is one{many}: give that folder"
 
 
 def _is_known(path: Path) -> bool:

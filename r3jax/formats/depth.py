@@ -108,7 +108,7 @@ def _pixels_of_colmap(data: bytes, header: re.Match[bytes]) -> np.ndarray:
     left = len(data) - header.end()
     if left != 4 * width * height:
         raise ForeignFileError(
-            f"it promises {width} x {height} pixels, but {left} bytes follow: is it cut off?"
+            f"truncated: it declares {width} x {height} pixels, but {left} bytes follow"
         )
     return np.frombuffer(data, "<f4", width * height, header.end()).reshape(height, width)
 

@@ -57,7 +57,7 @@ def export_run(
         OSError: `out` holds something; the disk is full, not writable, ...
     """
     if not run.rows:
-        raise FormatError(run.path, "the run has no views yet: there is nothing to export")
+        raise FormatError(run.path, "the run has no views yet")
     if "\0" in str(out):
         raise FormatError(Path(repr(out.name)), "this cannot be the name of a folder")
     check_vacant(out)

@@ -84,9 +84,7 @@ class Lens:
         """Refuses what is no camera."""
         if self.model not in MODELS:
             known = ", ".join(MODELS)
-            raise ForeignFileError(
-                f"the camera model {self.model[:40]!r} is not known, only {known}"
-            )
+            raise ForeignFileError(f"unknown camera model {self.model[:40]!r}; known: {known}")
         names = MODELS[self.model][1]
         if len(self.params) != len(names):
             raise ForeignFileError(
@@ -99,9 +97,9 @@ class Lens:
             raise ForeignFileError(f"the camera's image is {self.width} x {self.height} pixels")
         fx, fy, cx, cy = self.intrinsics
         if min(fx, fy) < 1e-3 or max(fx, fy) > 1e9:
-            raise ForeignFileError(f"no camera has the focal lengths {fx:g} and {fy:g} [px]")
+            raise ForeignFileError(f"invalid focal lengths {fx:g} and {fy:g} [px]")
         if max(abs(cx), abs(cy)) > 1e9:
-            raise ForeignFileError(f"no camera has the principal point ({cx:g}, {cy:g})")
+            raise ForeignFileError(f"invalid principal point ({cx:g}, {cy:g})")
 
     @property
     def named(self) -> dict[str, float]:

@@ -207,7 +207,7 @@ def _depth_unit(content: _Fields) -> DepthUnit:
     scales = [float(scale) for scale in given.values()]
     if max(scales) > 1.001 * min(scales):
         both = " and ".join(f"{key} {scale:g}" for key, scale in given.items())
-        raise ForeignFileError(f"it names two units of depth, {both}: take the wrong one out")
+        raise ForeignFileError(f"it has two units of depth, {both}: remove the wrong one")
     floats = scales[0] if _DEPTH_SCALES[0] in given else DepthUnit.metres_per_unit
     return DepthUnit(scales[0], beyond, metres_per_unit=floats)
 
@@ -229,7 +229,7 @@ def _applied_scale(content: _Fields) -> float:
     if scale is None:
         return 1.0
     if not 1e-9 < scale < 1e9:
-        raise ForeignFileError(f"the applied_scale {scale:g} makes no sense")
+        raise ForeignFileError(f"invalid applied_scale {scale:g}")
     return float(scale)
 
 
@@ -303,7 +303,9 @@ def _lens_of(fields: _Fields, width: int, height: int) -> Lens:
     if _MODELS[name] == "OPENCV_FISHEYE" or fields.get("is_fisheye") is True:
         return Lens("OPENCV_FISHEYE", width, height, (*values, k1, k2, k3, k4))
     if k4:
-        raise ForeignFileError("k4 belongs to a fisheye camera, but the model is a perspective one")
+        raise ForeignFileError(
+            "k4 is a parameter of fisheye cameras, but the model is a perspective one"
+        )
     if k3:
         return Lens("FULL_OPENCV", width, height, (*values, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
     if k1 or k2 or p1 or p2:

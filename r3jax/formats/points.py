@@ -93,7 +93,9 @@ def _header(data: bytes) -> _Vertices:
     end = data.find(b"end_header", 0, _MAX_HEADER)
     line_end = data.find(b"\n", end) if end >= 0 else -1
     if not data.startswith(b"ply") or line_end < 0:
-        raise ForeignFileError("this is no PLY file (no `ply` at its beginning, or no end_header)")
+        raise ForeignFileError(
+            "this is not a PLY file (no `ply` at its beginning, or no end_header)"
+        )
     lines = [line.split() for line in data[:end].decode("ascii", "replace").splitlines()]
     order, count = None, None
     fields: dict[str, str] = {}
@@ -109,7 +111,7 @@ def _header(data: bytes) -> _Vertices:
                 raise ForeignFileError(f"the vertices have the property {' '.join(words)[:80]!r}")
             fields[words[2]] = _KINDS[words[1]]
     if order is None or count is None:
-        raise ForeignFileError("the header names no format that is known, or no element")
+        raise ForeignFileError("the header has no known format, or no element")
     missing = sorted(set("xyz") - fields.keys())
     if missing:
         raise ForeignFileError(f"the vertices are missing {', '.join(missing)}")
@@ -155,7 +157,7 @@ def _text_table(data: bytes, vertices: _Vertices) -> np.ndarray:
     for column, (name, kind) in enumerate(kinds):
         values = numbers[:, column]
         if kind == "i8" and not np.all(np.abs(values) < 1 << 53):
-            raise ForeignFileError(f"`{name}` holds values that are no whole numbers")
+            raise ForeignFileError(f"`{name}` contains values that are not integers")
         table[name] = values
     return table
 

@@ -212,7 +212,7 @@ class PosedImages:
             )
         depth_path = self.depth_paths[index]
         if depth_path is None:
-            raise FormatError(path, "there is no depth image that belongs to it")
+            raise FormatError(path, "it has no depth image")
         rgb, is_there = self.masked_rgb(index)
         depth = self.depth(index)
         if depth is not None and is_there is not None:

@@ -181,15 +181,15 @@ def submission_of_run(run: Run) -> Submission:
     header = run.header
     check_decided_alone(run)
     if header.parent is not None:
-        raise RunError(run.path, "it is a fork: part of its views is another run's choice")
+        raise RunError(run.path, "it is a fork: some of its views were chosen by another run")
     if run.end is None or run.end.outcome not in COMPLETE:
         raise RunError(
             run.path,
-            f"it is not over ({run.outcome}): go on with `r3jax explore --resume {run.path}`",
+            f"it is incomplete ({run.outcome}): continue by `r3jax explore --resume {run.path}`",
         )
     if header.scene.get("start") is not None:
         raise RunError(
-            run.path, "it began at a --start of its own; the protocol begins where the scene does"
+            run.path, "it began at its own --start; the protocol begins at the scene's start"
         )
     given = dataclasses.asdict(config_of(run))
     default = dataclasses.asdict(ExplorationConfig())
@@ -308,12 +308,12 @@ def parse_submission(data: bytes) -> Submission:
 def _header_of(plain: Any) -> dict[str, Any]:
     """Reads the fields of the first line, except for format and versions."""
     if not isinstance(plain, dict) or plain.get("format") != FORMAT:
-        raise ForeignFileError(f"this is no submission (no format {FORMAT!r})")
+        raise ForeignFileError(f"this is not a submission (no format {FORMAT!r})")
     check_version(plain.get("version"), VERSION)
     protocol = plain.get("protocol")
     if type(protocol) is not int or protocol != PROTOCOL:  # True equals 1
         raise ForeignFileError(
-            f"protocol {protocol!r:.20}, this package judges by protocol {PROTOCOL}: "
+            f"protocol {protocol!r:.20}, this package uses protocol {PROTOCOL}: "
             "export the run again, or use the r3jax of that protocol"
         )
     fields = {k: v for k, v in plain.items() if k not in ("format", "version", "protocol")}
@@ -354,9 +354,9 @@ def _frame_of(plain: Any, number: int) -> SubmittedFrame:
         ready["path"] = table_of("path", known["path"], (-1, 3))
     frame = build(SubmittedFrame, plain, **ready)
     if frame.frame != number:
-        raise ForeignFileError(f"frame {frame.frame} comes where frame {number} should be")
+        raise ForeignFileError(f"expected frame {number}, found frame {frame.frame}")
     if frame.path is not None and len(frame.path) < 2:
-        raise ForeignFileError("`path` needs two waypoints: where it begins, and where it ends")
+        raise ForeignFileError("`path` needs at least two waypoints: its start and its end")
     return frame
 
 

@@ -65,7 +65,7 @@ class Video:
         """
         if not 0 <= number < len(self._times):
             raise FormatError(
-                self._path, f"the video has {len(self)} frames, none of number {number}"
+                self._path, f"the video has {len(self)} frames, but no frame {number}"
             )
         if not self._next <= number < self._next + _AHEAD:
             self._frames = self._from(number)

@@ -193,7 +193,7 @@ def without(*topics, **fields):
 DAMAGED = {
     "no depth": (without(DEPTH), "there are no depth images .*only /camera.*record them, too"),
     "no color": (without(COLOR), "there are no color images .rgb8, bgr8, mono8 or JPEG."),
-    "no info": (Robot(info=False), f"no camera_info that belongs to {COLOR}: record it"),
+    "no info": (Robot(info=False), f"no camera_info for {COLOR}: record it"),
     "no tf": (
         without("/tf"),
         "camera_color_optical_frame.* was, tf only has .*camera_link in base_link: record /tf",
@@ -255,7 +255,7 @@ def test_names_that_a_bag_does_not_have_are_refused(tmp_path):
         read_bag(path, Topics(world="mars"))
     with pytest.raises(ValueError, match="kolor=/x"):
         parse_topics("kolor=/x")
-    with pytest.raises(FormatError, match="topics were named, but this is no ROS bag"):
+    with pytest.raises(FormatError, match="--topics was given, but this is not a ROS bag"):
         open_capture(tmp_path, topics=Topics())
 
 

@@ -197,12 +197,12 @@ def test_a_name_that_no_line_holds_is_not_written(tmp_path):
     model = random_model(0)
     torn = dataclasses.replace(model.images[0], name="two\nlines.png")
     model = dataclasses.replace(model, images=(torn,))
-    with pytest.raises(ValueError, match="text format cannot hold"):
+    with pytest.raises(ValueError, match="text format cannot store"):
         write_text(tmp_path, model)
 
 
 def test_no_model_is_said(tmp_path):
-    with pytest.raises(FormatError, match="holds no COLMAP model"):
+    with pytest.raises(FormatError, match="contains no COLMAP model"):
         read_colmap(tmp_path)
     with pytest.raises(FormatError, match="no such folder"):
         read_colmap(tmp_path / "nowhere")

@@ -46,7 +46,7 @@ FOLDERS = {
     "nothing": ({"notes.txt": b""}, "this is neither a run .run.json., a recording"),
     "one below": (
         {f"day1/{name}": data for name, data in sequences.tum().items()},
-        r"no capture itself, but \S+scan/day1 is one: give that folder",
+        r"not a capture, but \S+scan/day1 is one: give that folder",
     ),
     "some below": (
         {f"seq-0{k}/{n}": d for k in (1, 2, 3) for n, d in sequences.seven_scenes().items()},

@@ -323,9 +323,9 @@ def _brightness(lit: Light, names: _Names) -> Finding | None:
     change = lit.change(lit.brightness)
     numbers, captions = _beside(lit, lit.brightness, change, names)
     many = (
-        f"half of the pairs: by more than {100 * np.expm1(typical):.0f} %"
+        f"half of the pairs differ by more than {100 * np.expm1(typical):.0f} %"
         if typical >= np.log1p(_LITTLE)
-        else "most pairs: hardly, so it changed now and then, and not all the time"
+        else "most pairs hardly differ, so it changed only occasionally"
     )
     what = (
         f"Brightness changes by up to {100 * np.expm1(largest):.0f} % between pictures of the same "

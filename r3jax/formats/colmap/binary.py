@@ -93,7 +93,7 @@ class _Cursor:
         """Reads the bytes up to the next zero byte, as a file's name."""
         end = self._data.find(b"\0", self._at, self._at + _LONGEST_NAME + 1)
         if end < 0:
-            raise ForeignFileError(f"an image's name at byte {self._at} has no end")
+            raise ForeignFileError(f"the image name at byte {self._at} is not terminated")
         name = os.fsdecode(self._data[self._at : end])
         self._at = end + 1
         return name
@@ -102,11 +102,11 @@ class _Cursor:
         """Refuses what follows behind the last row."""
         left = len(self._data) - self._at
         if left:
-            raise ForeignFileError(f"{left} bytes follow behind the last row: it is damaged")
+            raise ForeignFileError(f"damaged: {left} bytes after the last row")
 
     def _check(self, size: int) -> None:
         if self._at + size > len(self._data):
-            raise ForeignFileError(f"it is cut off: {size} bytes should follow byte {self._at}")
+            raise ForeignFileError(f"truncated: {size} bytes should follow byte {self._at}")
 
 
 def _cameras(file: _Cursor) -> dict[int, Lens]:
@@ -114,7 +114,7 @@ def _cameras(file: _Cursor) -> dict[int, Lens]:
     for _ in range(file.count("cameras", _CAMERA.size)):
         number, model, width, height = (int(x) for x in file.take(_CAMERA))
         if model not in NAMES:
-            raise ForeignFileError(f"camera {number} has the model {model}, which is not known")
+            raise ForeignFileError(f"camera {number} has the unknown model {model}")
         if number in cameras:
             raise ForeignFileError(f"the camera {number} occurs twice")
         params = file.take(struct.Struct(f"<{len(MODELS[NAMES[model]][1])}d"))
@@ -149,7 +149,7 @@ def _points(file: _Cursor) -> ColmapPoints:
     for i in range(count):
         number, *values, length = file.take(_POINT)
         if number > _LARGEST_ID or length * _TRACK.itemsize > _MAX_BYTES:
-            raise ForeignFileError(f"point {number} promises a track of {length} images")
+            raise ForeignFileError(f"point {number} declares a track of {length} images")
         ids[i], lengths[i] = number, length
         xyz[i], rgb[i], error[i] = values[:3], values[3:6], values[6]
         tracks.append(file.table(_TRACK, int(length)))

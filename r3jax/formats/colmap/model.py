@@ -109,7 +109,7 @@ def pose_of(quaternion: np.ndarray, translation: np.ndarray) -> np.ndarray:
         ForeignFileError: see `rotation_of`; a translation that is not finite, or too far away.
     """
     if not np.all(np.abs(translation) < MAX_DISTANCE):  # NaN makes the comparison false
-        raise ForeignFileError(f"no camera is at the translation {translation.tolist()}")
+        raise ForeignFileError(f"the translation {translation.tolist()} is not finite or too large")
     R = rotation_of(quaternion)
     pose = np.eye(4)
     pose[:3, :3] = R.T

@@ -159,7 +159,7 @@ def _models(path: Path) -> tuple[Path, dict[Path, ColmapModel]]:
     dense = find_stereo(path)
     folder = find_model(path) if dense is None else dense / "sparse"
     if folder is None:
-        what = "the folder holds no COLMAP model (no cameras.bin or cameras.txt)"
+        what = "the folder contains no COLMAP model (no cameras.bin or cameras.txt)"
         raise FormatError(path, what if path.is_dir() else "there is no such folder")
     parts = _parts(path, folder) if dense is None else [folder]
     models = {part: read_model(part) for part in parts}
@@ -286,8 +286,8 @@ def _odd_lenses(model: ColmapModel) -> list[str]:
     if not odd:
         return []
     return [
-        f"{odd[0]} is no real lens, so poses and points are likely wrong: reconstruct again with "
-        "known intrinsics (--ImageReader.camera_params) or more overlap"
+        f"{odd[0]} is not a plausible lens, so poses and points are likely wrong: reconstruct "
+        "again with known intrinsics (--ImageReader.camera_params) or more overlap"
     ]
 
 

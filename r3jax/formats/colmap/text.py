@@ -56,7 +56,7 @@ def write_text(folder: Path, model: ColmapModel) -> None:
     """
     for image in model.images:
         if image.name != image.name.strip() or len(image.name.splitlines()) != 1:
-            raise InputError(f"the text format cannot hold the name {image.name!r}: use binary")
+            raise InputError(f"the text format cannot store the name {image.name!r}: use binary")
     for name, lines in (
         ("cameras.txt", _camera_lines(model)),
         ("images.txt", _image_lines(model)),
@@ -114,7 +114,7 @@ def _point_id(word: str) -> int:
 def _words(text: str, least: int, what: str) -> list[str]:
     words = text.split()
     if len(words) < least:
-        raise ForeignFileError(f"{what} takes {least} words or more, found {len(words)}")
+        raise ForeignFileError(f"{what} needs at least {least} words, found {len(words)}")
     return words
 
 
@@ -137,7 +137,7 @@ def _images(path: Path) -> Iterator[ColmapImage]:
 def _image(text: str, keypoints: np.ndarray, point_ids: np.ndarray) -> ColmapImage:
     words = text.split(maxsplit=9)  # a name may hold blanks
     if len(words) < 10:
-        raise ForeignFileError(f"an image takes 10 words, found {len(words)}")
+        raise ForeignFileError(f"an image needs 10 words, found {len(words)}")
     pose = np.array([_number(word) for word in words[1:8]])
     return ColmapImage(
         id=_id(words[0]),
@@ -153,7 +153,7 @@ def _image(text: str, keypoints: np.ndarray, point_ids: np.ndarray) -> ColmapIma
 def _keypoints(text: str) -> tuple[np.ndarray, np.ndarray]:
     words = text.split()
     if len(words) % 3:
-        raise ForeignFileError(f"keypoints take three numbers each, found {len(words)} words")
+        raise ForeignFileError(f"keypoints need three numbers each, found {len(words)} words")
     x, y = ([_number(word) for word in words[axis::3]] for axis in range(2))
     return np.array([x, y]).T.reshape(-1, 2), np.array(list(map(_point_id, words[2::3])), np.int64)
 

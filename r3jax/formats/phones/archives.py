@@ -208,11 +208,11 @@ def open_zip(path: Path) -> zipfile.ZipFile:
             zipped = zipfile.ZipFile(path)
         except Exception as error:  # cut off, no archive, seeks before the beginning, ...
             raise ForeignFileError(
-                f"this is no whole zip archive ({error!s:.200}): copy or export it again"
+                f"this is not a complete zip archive ({error!s:.200}): copy or export it again"
             ) from None
         if len(zipped.NameToInfo) > _MAX_MEMBERS:
             raise ForeignFileError(
-                f"the archive holds {len(zipped.NameToInfo):,} files, more than {_MAX_MEMBERS:,}: "
+                f"the archive has {len(zipped.NameToInfo):,} files, more than {_MAX_MEMBERS:,}: "
                 "unpack it and give its folder"
             )
         return zipped

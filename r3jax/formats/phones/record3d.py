@@ -198,7 +198,9 @@ def load_decoder(path: Path) -> Any:
         reason = why_not_imported(error, "lzfse", what_for, "phones")
         raise FormatError(path, reason) from None
     except (AttributeError, OSError) as error:
-        reason = f"the package lzfse does not hold its decoder ({error!s:.200}): another version?"
+        reason = (
+            f"the package lzfse does not contain its decoder ({error!s:.200}): another version?"
+        )
         raise FormatError(path, reason) from None
     size, pointer = ctypes.c_size_t, ctypes.c_char_p
     decoder.argtypes = [pointer, size, pointer, size, ctypes.c_void_p]

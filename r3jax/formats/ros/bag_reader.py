@@ -68,7 +68,7 @@ class ImageTimes:
         for stamped in bag.messages([self.topic], time, time + 1):
             if stamp_of(stamped.message, stamped.time) == self.stamps[index]:
                 return stamped.message
-        raise FormatError(bag.path, f"an image on {self.topic} is not there any more")
+        raise FormatError(bag.path, f"an image on {self.topic} has been removed")
 
     def name(self, bag: AnyBag, index: int) -> Path:
         """Names an image in messages: its topic and its stamp [s]."""
@@ -111,7 +111,7 @@ class BagReading:
         if lens is None:
             raise FormatError(
                 bag.path,
-                f"there is no camera_info that belongs to {self._color.name}: record it, or name "
+                f"there is no camera_info for {self._color.name}: record it, or name "
                 "it by --topics info=TOPIC",
             )
         self._lens, self._tree = lens, TransformTree()
@@ -281,7 +281,7 @@ def _depth_camera(
         return own
     upwards = {frame: tree.chain(frame) for frame in (color, depth)}
     if upwards[color][-1] != upwards[depth][-1]:
-        note = f" No transform leads from {depth} to {color}: they count as one place."
+        note = f" There is no transform from {depth} to {color}: they are taken as equal."
         return own._replace(remark=note)
     at = np.array([stamp_of(images[0].first)])
     T_root = {frame: tree.poses(chain, at)[0][0] for frame, chain in upwards.items()}

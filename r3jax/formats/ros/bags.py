@@ -314,10 +314,10 @@ def unpack_chunk(data: bytes, compression: str, size: int | None = None) -> byte
     """
     most = MAX_CHUNK if size is None else size
     if most > MAX_CHUNK:
-        raise ForeignFileError(f"a chunk of {size} bytes is more than {MAX_CHUNK} and not read")
+        raise ForeignFileError(f"a chunk of {size} bytes exceeds the limit of {MAX_CHUNK}")
     found = data if compression in ("", "none") else _unpacked(data, compression, most + 1)
     if len(found) > most or size not in (None, len(found)):
-        raise ForeignFileError(f"a chunk holds more or less than the {most} bytes it may hold")
+        raise ForeignFileError(f"a chunk does not unpack to {most} bytes")
     return found
 
 
@@ -343,7 +343,7 @@ def _decompressor(compression: str) -> Any:
         else:
             from backports import zstd
         return zstd.ZstdDecompressor()
-    raise ForeignFileError(f"chunks packed by {compression[:20]!r} are not read")
+    raise ForeignFileError(f"unsupported compression of chunks: {compression[:20]!r}")
 
 
 @dataclass(frozen=True)

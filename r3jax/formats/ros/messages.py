@@ -137,7 +137,7 @@ def rgb_of(message: Any) -> np.ndarray:
         return _from_yuv(_rows(message, np.dtype("u1"), 2), _YUV[encoding])
     if encoding not in _CHANNELS:
         known = ", ".join((*_CHANNELS, *_BAYER, *_YUV, *_GRAY))
-        raise ForeignFileError(f"images of the encoding {encoding[:40]!r} are not read: {known}")
+        raise ForeignFileError(f"unsupported image encoding {encoding[:40]!r}: {known}")
     channels, order = _CHANNELS[encoding]
     pixels = _levels(message, encoding, channels)
     return pixels.reshape(message.height, message.width, channels)[..., order]
@@ -206,7 +206,7 @@ def depth_of(message: Any) -> np.ndarray:
     """
     encoding = encoding_of(message)
     if encoding not in _DEPTHS:
-        raise ForeignFileError(f"{encoding[:40]!r} is no encoding of depth")
+        raise ForeignFileError(f"{encoding[:40]!r} is not an encoding of depth")
     is_meters = _DEPTHS[encoding] == "f4"
     if not hasattr(message, "encoding"):
         return _unpacked(bytes(message.data), str(message.format), is_meters)
@@ -303,7 +303,7 @@ def _distortion(name: str, coefficients: np.ndarray) -> tuple[str, tuple[float, 
     """Returns COLMAP's name of a lens, and its coefficients."""
     if name not in _MODELS:
         raise ForeignFileError(
-            f"the distortion {name[:40]!r} is not known, only {', '.join(filter(None, _MODELS))}: "
+            f"unknown distortion {name[:40]!r}, known: {', '.join(filter(None, _MODELS))}: "
             "record the rectified images (image_proc)"
         )
     model, count = _MODELS[name]

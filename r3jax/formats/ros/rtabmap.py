@@ -233,9 +233,9 @@ def _camera(path: Path, number: int, data: bytes) -> tuple[Lens, np.ndarray]:
     middle = begin + 8 * sum(counts)
     end = middle + 4 * places
     if len(data) < end:
-        raise ForeignFileError(f"the camera of node {number} is cut off")
+        raise ForeignFileError(f"the camera of node {number} is truncated")
     if len(data) >= end + 4 * _HEADER:
-        raise ForeignFileError("a node has several cameras, which are not read: export one of them")
+        raise ForeignFileError("nodes with several cameras are not supported: export one of them")
     parts = np.split(np.frombuffer(data[begin:middle], "<f8"), np.cumsum(counts)[:-1])
     K, P = parts[0], parts[3]
     matrix = P if len(P) == 12 else K
@@ -380,7 +380,7 @@ def _matrix(text: str, name: str, count: int) -> np.ndarray | None:
     try:
         numbers = np.array([float(word) for word in found[1].split(",")])
     except ValueError:
-        raise ForeignFileError(f"{name} holds a word that is no number") from None
+        raise ForeignFileError(f"{name} contains a word that is not a number") from None
     if len(numbers) != count:
         raise ForeignFileError(f"{name} must have {count} numbers, got {len(numbers)}")
     return numbers

@@ -70,7 +70,7 @@ def find_images(bag: AnyBag, topics: Topics) -> tuple[ImageTopic, ImageTopic]:
     by_name = {one.name: one for one in images}
     for name in (topics.color, topics.depth):
         if name is not None and name not in by_name:
-            raise FormatError(bag.path, f"{name} holds no images but {bag.types[name]}")
+            raise FormatError(bag.path, f"{name} has no images but {bag.types[name]}")
     colors = [one for one in images if is_color(one.first)]
     if not colors:  # a gray camera, or infrared
         colors = [one for one in images if is_gray(one.first) and "depth" not in one.name]
@@ -222,12 +222,12 @@ def find_chain(
         )
     if topics.world is not None and chain[-1] != topics.world:
         raise FormatError(
-            bag.path, f"no transform leads from {camera} to {topics.world}, only to {chain[-1]}"
+            bag.path, f"there is no transform from {camera} to {topics.world}, only to {chain[-1]}"
         )
     if not tree.is_timed(chain):
         raise FormatError(
             bag.path,
-            f"nothing says where {camera}, the frame of the images, was{_known(tree)}: record /tf "
+            f"there are no poses of {camera}, the frame of the images{_known(tree)}: record /tf "
             "and /tf_static, or odometry (--topics pose=TOPIC)",
         )
     return chain

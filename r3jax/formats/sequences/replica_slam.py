@@ -65,7 +65,7 @@ def _numbered(folder: Path, start: str) -> dict[str, Path]:
     kinds = (".png", ".jpg", ".jpeg")
     found = [p for p in folder.glob(f"{start}*") if p.suffix.lower() in kinds]
     if not found:
-        raise FormatError(folder, f"the folder holds no image {start}*.jpg or {start}*.png")
+        raise FormatError(folder, f"the folder contains no image {start}*.jpg or {start}*.png")
     return {image.stem.removeprefix(start): image for image in found}
 
 
@@ -79,7 +79,7 @@ def _camera(path: Path) -> tuple[Lens, DepthUnit]:
         camera: dict[str, Any] = content["camera"]
         check_fields("camera", camera, _FIELDS)
         if not 1e-3 < camera["scale"] < 1e9:
-            raise ForeignFileError(f"the scale {camera['scale']:g} makes no sense")
+            raise ForeignFileError(f"invalid scale {camera['scale']:g}")
         # Pixel centers lie at whole numbers there.
         center = (camera["cx"] + 0.5, camera["cy"] + 0.5)
         params = (float(camera["fx"]), float(camera["fy"]), *center)

@@ -183,7 +183,7 @@ def _take(file: BinaryIO, count: int) -> bytes:
 def _head(file: BinaryIO) -> _Head:
     version, length = struct.unpack("<IQ", _take(file, 12))
     if version != _VERSION:
-        raise ForeignFileError(f"its version is {version}, only {_VERSION} is read")
+        raise ForeignFileError(f"unsupported version {version}, only {_VERSION} is read")
     if length > _LONGEST_NAME:
         raise ForeignFileError(f"the name of its sensor has {length} characters")
     _take(file, length)
@@ -196,9 +196,9 @@ def _head(file: BinaryIO) -> _Head:
             "and plain or zlib are read"
         )
     if not 1e-3 < steps < 1e9:
-        raise ForeignFileError(f"{steps:g} steps of depth a meter make no sense")
+        raise ForeignFileError(f"invalid depth unit: {steps:g} steps per meter")
     if max(width * height, depth_width * depth_height) > MAX_PIXELS:
-        raise ForeignFileError(f"more than {MAX_PIXELS} pixels are not read")
+        raise ForeignFileError(f"images have more than {MAX_PIXELS} pixels")
     return _Head(
         lens=matrix_lens(matrices[0], (width, height)),
         depth_lens=matrix_lens(matrices[2], (depth_width, depth_height)),
@@ -211,7 +211,7 @@ def _head(file: BinaryIO) -> _Head:
 def _counted(count: int, size: int) -> int:
     """Reads the number of frames, which must fit into a file of this size."""
     if not 0 < count <= size // _FRAME.size:
-        raise ForeignFileError(f"it claims to hold {count} frames in {size} bytes: copy it again")
+        raise ForeignFileError(f"it declares {count} frames in {size} bytes: copy it again")
     return count
 
 

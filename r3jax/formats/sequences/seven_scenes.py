@@ -52,7 +52,7 @@ def read_seven_scenes(path: Path | str) -> PosedImages:
     path = Path(path)
     found = _colors(path)
     if not found:
-        raise FormatError(path, "the folder holds no frame-*.color.png or .jpg")
+        raise FormatError(path, "the folder contains no frame-*.color.png or .jpg")
     depths = {depth.name.removesuffix(_DEPTH) for depth in path.glob(f"frame-*{_DEPTH}")}
     bases = sorted(depths.union(found))
     return PosedImages(

@@ -115,7 +115,7 @@ def test_a_submission_that_was_killed_is_judged_again_from_its_first_frame(
         with pytest.raises(BaseException, match="killed"):
             run_cell(cell, tmp_path)
     stored_submission(tmp_path, cell.submission).write_text("{}")
-    with pytest.raises(ValueError, match="no submission"):
+    with pytest.raises(ValueError, match="not a submission"):
         run_cell(cell, tmp_path)
     shorter = dataclasses.replace(submission, frames=submission.frames[:2])
     write_submission(stored_submission(tmp_path, cell.submission), shorter)
@@ -408,8 +408,8 @@ def test_a_run_that_is_no_exploration_is_not_exported(finished, how):
     else:
         header = dataclasses.replace(header, parent={how: ["x"]})
     says = {
-        "cut off": "it is not over",
-        "interrupted": "it is not over",
+        "cut off": "it is incomplete",
+        "interrupted": "it is incomplete",
         "forked": "it is a fork",
         "merged": "merged from runs",
         "a start of its own": "--start",
