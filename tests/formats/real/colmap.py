@@ -129,6 +129,6 @@ LAYOUTS = (
         "colmap, text", lambda: text_model(_JPEGS) | photos("images", _JPEGS), poses_off=1e-9,
         **_COMMON,
     ),
-    Layout("colmap, a lens that ran away", _failed, remark=("Camera 1 ", "not a plausible lens"), **_COMMON),
+    Layout("colmap, a lens that ran away", _failed, remark=("Camera 1 ", "plausible"), **_COMMON),
     Layout("colmap_text of instant-ngp", _instant_ngp, **_COMMON),
 )  # fmt: skip
