@@ -1,1 +1,1 @@
-"""Other people's files: recordings and datasets."""
+"""Readers and writers of captures, recordings and data sets."""

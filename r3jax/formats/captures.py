@@ -1,4 +1,4 @@
-"""What can be trained on, judged or audited: runs, recordings, posed images, opened in one way."""
+"""Opens everything that can be trained on, evaluated or audited: runs, recordings, posed images."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -47,7 +47,7 @@ _FORMATS: tuple[tuple[Callable[[Path], bool], Callable[[Path], PosedImages]], ..
     (is_rtabmap_database, read_rtabmap_database),
     (is_bag, read_bag),
 )
-"""Folders and archives of posed images: what each looks like, and its reader."""
+"""Formats of posed images: a test for each, and its reader."""
 
 _KNOWN = (
     "a run (run.json), a recording (poses.txt, images/), nerfstudio's transforms.json or NeRF's "
@@ -61,15 +61,15 @@ _KNOWN = (
 )
 
 _COMMON_NAME = re.compile(r"\d+|sparse|dense|colmap|undistorted|raw|seq-?\d+", re.IGNORECASE)
-"""Names of folders that say nothing of the capture in them."""
+"""Common folder names, which do not identify a capture."""
 
 _MOST_BELOW = 100
-"""Folders that are looked into, where the one given is no capture."""
+"""Subfolders to search if the given folder is not a capture."""
 
 
 @dataclass(frozen=True)
 class Capture:
-    """Posed images on disk; with depth, unless they are posed images without."""
+    """Posed images on disk, with or without depth."""
 
     path: Path
     source: Run | PosedImages
@@ -83,7 +83,7 @@ class Capture:
     def name(self) -> str:
         """The folder's name, or that of an archive without its suffix.
 
-        Of a folder with a common name it starts with those above: `scan-sparse-0`.
+        If that is a common name, it starts with the parent folders: `scan-sparse-0`.
         """
         path = self.path.resolve()
         if path.is_file():
@@ -103,7 +103,7 @@ class Capture:
 
     @property
     def models(self) -> Path:
-        """Folder of the models; somebody else's capture stays untouched."""
+        """Folder of the models; nothing is written into captures of other programs."""
         if self.run is not None:
             return self.path / "models"
         return Path("runs") / self.name / "models"
@@ -113,12 +113,12 @@ def open_capture(path: Path, up: Literal["y", "z"] = "y", topics: Topics | None 
     """Opens a run, a recording, or posed images of any format.
 
     Args:
-        path: the folder, or the archive as an app shares it; of nerfstudio also the file.
+        path: the folder, an app's archive, or nerfstudio's file.
         up: axis of a recording's world that points up; the others stay as they are.
-        topics: names of a ROS bag's topics and frames; None: all are guessed.
+        topics: names of a ROS bag's topics and frames; None: detected.
 
     Raises:
-        FormatError: it is none of them, or one that is broken.
+        FormatError: an unknown or a broken format.
         RunError: it is a run, but broken.
     """
     if topics is not None:
@@ -140,7 +140,7 @@ def open_capture(path: Path, up: Literal["y", "z"] = "y", topics: Topics | None 
 
 
 def _below(path: Path) -> str | None:
-    """Names the subfolder that is a capture, where the folder itself is none."""
+    """Finds a subfolder that is a capture, if the folder itself is not."""
     if not path.is_dir():
         return None
     folders = sorted(entry for entry in path.iterdir() if entry.is_dir())[:_MOST_BELOW]
@@ -152,6 +152,6 @@ def _below(path: Path) -> str | None:
 
 
 def _is_known(path: Path) -> bool:
-    """Checks whether a folder looks like something that can be opened, whole or not."""
+    """Checks whether a folder looks like a supported format, complete or not."""
     is_ours = (path / "run.json").exists() or is_recording(path)
     return is_ours or any(fits(path) for fits, _ in _FORMATS)

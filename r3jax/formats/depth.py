@@ -2,8 +2,9 @@
 
 PNG, TIFF and NumPy's files hold whole numbers of steps; TIFF, NumPy's files and EXR hold floats.
 
-Phones measure depth with few pixels (256 x 192) beside large images (1920 x 1440). Depth is brought
-to the image's pixels by its nearest pixel, never interpolated: a mean of two surfaces is none.
+Phones measure depth with few pixels (256 x 192) beside large images (1920 x 1440). Depth is
+resampled to the image by its nearest pixel, never interpolated: the mean of two surfaces is not a
+surface.
 
 Shape symbols: H, W size of the color image; h, w size of the depth image.
 """
@@ -39,19 +40,19 @@ _BACKGROUND = 1e9
 
 @dataclass(frozen=True)
 class DepthUnit:
-    """What the numbers in a depth image mean; 0 is no measurement."""
+    """The meaning of the numbers in a depth image; 0 is no measurement."""
 
     metres_per_step: float = 0.001
     """Units of the capture per step of whole numbers."""
 
     beyond_range: int | None = None
-    """Stored where nothing lies within the sensor's range; None: there is no such number."""
+    """Value for pixels beyond the sensor's range; None: there is no such value."""
 
     invalid: int | None = None
-    """Stored, beside 0, where there is no measurement; None: there is no such number."""
+    """Value, beside 0, of pixels without a measurement; None: there is no such value."""
 
     metres_per_unit: float = 1.0
-    """Units of the capture per 1.0 where the numbers are floats."""
+    """Units of the capture per 1.0, for floats."""
 
     def depth(self, steps: np.ndarray) -> np.ndarray:
         """Converts stored numbers to z-depth [h, w] float32.
@@ -114,7 +115,7 @@ def _pixels_of_colmap(data: bytes, header: re.Match[bytes]) -> np.ndarray:
 
 
 def check_exr() -> None:
-    """Refuses to go on without OpenEXR.
+    """Checks that OpenEXR is installed.
 
     Raises:
         ForeignFileError: it is not installed; names the extra.

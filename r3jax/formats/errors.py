@@ -1,4 +1,4 @@
-"""What can go wrong with somebody else's files."""
+"""Errors of files of other programs."""
 
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -10,7 +10,7 @@ from r3jax.validation.files import check_regular
 
 
 class FormatError(PathError):
-    """A file or folder that cannot be read; names it and the reason."""
+    """A file or folder cannot be read; names it and the reason."""
 
 
 @contextmanager
@@ -61,10 +61,10 @@ _ADVICE = {
 
 
 def check_capture(path: Path) -> None:
-    """Refuses what is neither a folder nor a capture's file, before anything heavy is imported.
+    """Refuses a path that is neither a folder nor a capture's file. Imports nothing heavy.
 
     Raises:
-        FormatError: says what a capture is.
+        FormatError: lists the supported formats.
     """
     if not path.exists():
         kind = "file" if path.suffix.lower() in (*CAPTURE_FILES, *_ADVICE) else "folder"

@@ -1,10 +1,10 @@
-"""A run as a folder that other programs train on: images, poses, points, nothing that is elsewhere.
+"""Exports a run as a self-contained folder for other trainers: images, poses, points.
 
     nerfstudio     images/ depth/ points.ply transforms.json
     colmap         images/ depth/ points.ply sparse/0/{cameras,images,points3D}.bin
     colmap-text    the same with .txt
 
-Poses are the run's own: meters, z up, nothing turned, centered or scaled. Depth images are
+Poses are those of the run: meters, z up, neither rotated, centered nor scaled. Depth images are
 copies: uint16 in steps of 0.2 mm. COLMAP has no place for depth; it lies beside the images.
 """
 
@@ -40,7 +40,7 @@ _POINTS = "points.ply"
 def export_run(
     run: Run, out: Path, kind: Format, on_view: Callable[[], None] = lambda: None
 ) -> int:
-    """Writes the folder; it is complete or not there.
+    """Writes the folder, either completely or not at all.
 
     Args:
         run: a run with at least one view.

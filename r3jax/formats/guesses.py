@@ -1,4 +1,4 @@
-"""Guesses what a folder is that no reader understands, and the command that would convert it."""
+"""Guesses the content of an unsupported folder, and suggests a command to convert it."""
 
 import os
 import re
@@ -29,7 +29,7 @@ _MOST = 2000
 
 
 def nearest_guess(path: Path) -> str | None:
-    """Says what a folder or archive looks like and what to do with it, in one sentence.
+    """Describes what a folder or archive looks like and what to do with it, in one sentence.
 
     Args:
         path: it exists, and no reader took it.

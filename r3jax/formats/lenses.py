@@ -1,4 +1,4 @@
-"""Intrinsics of other people's cameras: COLMAP's models, by name, with their parameters.
+"""Camera models with distortion: COLMAP's models and their parameters.
 
 The parameters are COLMAP's: focal lengths and principal point [px] first, where the upper left
 pixel's center lies at (0.5, 0.5) as in this package, then the distortion. r3jax's own `Camera` is
@@ -56,7 +56,7 @@ _PINHOLE_WITHOUT_DISTORTION = (
 """Models that are a pinhole where all their distortion is zero; a fisheye lens never is."""
 
 MAX_SIDE = 1 << 16
-"""Images with more columns or rows come from no camera [px]."""
+"""Maximum width and height of images [px]."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Lens:
     """Parameters in the order of `MODELS`."""
 
     def __post_init__(self) -> None:
-        """Refuses what is no camera."""
+        """Refuses invalid cameras."""
         if self.model not in MODELS:
             known = ", ".join(MODELS)
             raise ForeignFileError(f"unknown camera model {self.model[:40]!r}; known: {known}")
@@ -117,20 +117,17 @@ class Lens:
 
     @property
     def distortion(self) -> dict[str, float]:
-        """The parameters behind the principal point."""
+        """The parameters after the principal point."""
         skipped = 3 if MODELS[self.model][1][0] == "f" else 4
         return dict(list(self.named.items())[skipped:])
 
     @property
     def is_pinhole(self) -> bool:
-        """True if straight lines stay straight: `camera` is then all there is to know."""
+        """True if there is no distortion, so that `camera` is complete."""
         return self.model in _PINHOLE_WITHOUT_DISTORTION and not any(self.distortion.values())
 
     def has_shape(self, width: int, height: int) -> bool:
-        """Checks whether images of this size are this lens's, scaled.
-
-        Each side may be rounded to a pixel.
-        """
+        """Checks whether images of this size may be scaled images of this lens, up to rounding."""
         off = abs(width * self.height - height * self.width)
         return min(width, height) > 0 and off <= self.width + self.height
 

@@ -1,14 +1,14 @@
-"""Reads nerfstudio's transforms.json, as many programs write it, and writes that of a run.
+"""Reads transforms.json of nerfstudio and other programs, and writes that of a run.
 
-instant-ngp, Blender and phone apps write it too, each with some fields of its own.
+instant-ngp, Blender and phone apps also write it, each with some additional fields.
 
 OpenGL camera axes (x right, y up, z backward), camera to world, pixel centers at +0.5
 (https://docs.nerf.studio/quickstart/data_conventions.html).
 
-Read, poses stay in the coordinates of the file, as do the points of `ply_file_path`: those are the
-capture's own, and suggested cameras have to come back in them. `applied_transform` says how they
-were made of the coordinates of an earlier program; it is kept and not undone. `applied_scale` is
-undone where there are depth images, which were not scaled: poses are in their units again.
+Read, poses stay in the coordinates of the file, as do the points of `ply_file_path`: suggested
+cameras are written in the same coordinates. `applied_transform` says how they were made of the
+coordinates of an earlier program; it is kept and not undone. `applied_scale` is undone where there
+are depth images, which were not scaled: poses are in their units again.
 
 Written, they are in meters, world z up. Depth images are uint16; one step is
 `depth_unit_scale_factor` meters; 0 is no measurement and `depth_beyond_range_value` means that
@@ -45,7 +45,7 @@ _DEPTH = {
     "depth_unit_scale_factor": 1.0 / DEPTH_STEPS_PER_METRE,
     "depth_beyond_range_value": BEYOND_RANGE,
 }
-"""What the depth images of a run mean."""
+"""Meaning of the depth images of a run."""
 
 _MAX_BYTES = 256 << 20
 """A frame takes a kilobyte."""
@@ -73,9 +73,9 @@ _Fields = Mapping[str, Any]
 def read_transforms(path: Path | str) -> PosedImages:
     """Reads a transforms.json. The images come in the order of the file.
 
-    Intrinsics of a frame go before those of the file. Without a principal point it is the
-    image's center, without a size that of the image, or of another one where it is missing; names
-    without a suffix get that of an image that exists.
+    Intrinsics of a frame override those of the file. Without a principal point it is the image's
+    center, without a size that of the image, or of another one where it is missing; names without a
+    suffix get that of an image that exists.
 
     Args:
         path: the file, or the folder that holds one; of the data sets of NeRF, which are split,
@@ -189,9 +189,9 @@ def _depth(folder: Path, index: int, frame: _Fields) -> Path | None:
 
 
 def _depth_unit(content: _Fields) -> DepthUnit:
-    """Reads the unit from nerfstudio's key or instant-ngp's.
+    """Reads the unit from nerfstudio's or instant-ngp's key.
 
-    Without a key, whole numbers are millimeters and floats are meters.
+    Without a key, integers are millimeters and floats are meters.
 
     nerfstudio itself takes floats without a key for millimeters, but users store meters.
     """
@@ -413,7 +413,7 @@ _MAX_NORMALIZATION = 1 << 20
 
 
 class Normalization(NamedTuple):
-    """From original coordinates to those of a training."""
+    """The transformation from original coordinates to those of a training."""
 
     T: np.ndarray
     """Rigid, [4, 4]."""

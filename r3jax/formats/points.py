@@ -1,9 +1,9 @@
-"""Colored points as PLY: what 3DGS starts from, and what other programs say of a scene.
+"""Colored points as PLY: the initial points of 3DGS, and point clouds of other programs.
 
-The reader is written by hand. Of the 13 damages in its tests trimesh takes seven for a whole file
-(a point too few, a doubled name, numbers that are not finite); plyfile makes room for all points
-that a header promises before it looks how many follow, takes positions that are not finite, and
-its license, the GPL, is not ours.
+The reader is written by hand. Of the 13 kinds of damage in its tests, trimesh accepts seven (a
+missing point, a doubled name, numbers that are not finite); plyfile allocates memory for all
+declared points before counting them, accepts positions that are not finite, and has another license
+(GPL).
 
 Shape symbols: n points.
 """

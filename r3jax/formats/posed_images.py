@@ -1,6 +1,6 @@
-"""Posed images: what a transforms.json or a COLMAP model says of a capture.
+"""Posed images, as described by a transforms.json or a COLMAP model.
 
-Poses and points stay in the capture's own coordinates: nothing is turned, centered or scaled. A
+Poses and points stay in the capture's own coordinates, neither rotated, centered nor scaled. A
 COLMAP model without known positions is not in meters, and its world may be upside down.
 
 Images may lie elsewhere than a capture's file says: programs that train splats keep the originals
@@ -44,7 +44,7 @@ _MAX_DEPTH = 256 << 20
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """How well a structure from motion went; None where the model does not say."""
+    """Quality measures of a structure from motion; None if the model does not contain them."""
 
     posed: int
     """Pictures with a pose in this model."""
@@ -67,7 +67,7 @@ class Reconstruction:
 
 @dataclass(frozen=True)
 class SparsePoints:
-    """Points that a structure from motion found, and which image sees which."""
+    """Points from structure from motion, and the images that see them."""
 
     xyz: np.ndarray
     """Positions in the capture's coordinates, [m, 3] float64."""
@@ -92,7 +92,7 @@ class SparsePoints:
 
 @dataclass(frozen=True)
 class Pixels:
-    """Reads the pixels of a capture that is no folder of plain images: an archive, a video."""
+    """Reads the pixels of archives and videos."""
 
     rgb: Callable[[int], np.ndarray]
     """Colors of an image, [H, W, 3] uint8, of its lens' size; raises FormatError."""
@@ -103,10 +103,10 @@ class Pixels:
 
 @dataclass(frozen=True)
 class PosedImages:
-    """Images with their cameras and poses. Whether the files exist shows when they are read."""
+    """Images with their cameras and poses. Missing files are reported when they are read."""
 
     path: Path
-    """File or folder that says all this."""
+    """The file or folder of the capture."""
 
     image_paths: tuple[Path, ...]
     """One per image; not all of them need to exist."""
@@ -124,7 +124,7 @@ class PosedImages:
     """Meaning of the numbers in all depth images."""
 
     points: SparsePoints | None = None
-    """None where the capture comes without."""
+    """None if the capture has none."""
 
     points_path: Path | None = None
     """A PLY with further points, of which nothing says who sees them: see `read_points`."""
@@ -141,10 +141,10 @@ class PosedImages:
     covers what its image covers."""
 
     up: np.ndarray | None = None
-    """The vertical, [3] in the capture's coordinates; None: the format does not say."""
+    """The vertical, [3] in the capture's coordinates; None: unknown."""
 
     remark: str | None = None
-    """What else is there but not among the images, a sentence; None: nothing is left out."""
+    """A sentence on images that were left out; None: nothing was left out."""
 
     mask_paths: tuple[Path | None, ...] | None = None
     """One per image: black pixels of these images do not count (people, the sky, a turntable);
@@ -155,7 +155,7 @@ class PosedImages:
     unit is the poses'."""
 
     reconstruction: Reconstruction | None = None
-    """How well the structure from motion went; None: the format does not say."""
+    """Quality measures of the structure from motion; None: unknown."""
 
     def __len__(self) -> int:
         """Returns the number of images."""
@@ -171,7 +171,7 @@ class PosedImages:
         return dataclasses.replace(self, depth_paths=found, depth_unit=unit)
 
     def fitted(self) -> "PosedImages":
-        """Fits the lenses to the size of the image files, where only that differs.
+        """Scales the lenses to the size of the image files, if only that differs.
 
         Images are often reduced after their cameras were found. Of each lens the size of most of
         the first images that are there counts.

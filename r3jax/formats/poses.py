@@ -1,6 +1,6 @@
 """Poses from files: matrices, quaternions, and tables of numbers in text that hold them.
 
-What rounding did to a rotation is mended, anything worse is refused.
+Rounding errors of rotations are corrected, larger errors are refused.
 """
 
 import io
@@ -25,7 +25,7 @@ _ROUNDING = 1e-6
 """Rotations off by at most this stay as they are: float32 stores no better."""
 
 MAX_DISTANCE = 1e12
-"""Cameras farther from the origin than this are nowhere: squares would leave float32."""
+"""Maximum distance of cameras from the origin, so that squares fit in float32."""
 
 _MAX_TEXT = 64 << 20
 """A pose takes some hundred bytes."""

@@ -1,1 +1,1 @@
-"""COLMAP's sparse models: read, written, and made of a run."""
+"""Reads and writes COLMAP's sparse models, and makes them from runs."""

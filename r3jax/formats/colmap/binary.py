@@ -1,6 +1,6 @@
-"""COLMAP's binary files: little endian, every table behind the number of its rows.
+"""COLMAP's binary files: little endian, each table preceded by its number of rows.
 
-Every number of rows is compared with the bytes that are left before anything is made room for.
+Numbers of rows are compared with the remaining bytes before memory is allocated.
 """
 
 import os
@@ -18,7 +18,7 @@ from r3jax.validation.errors import ForeignFileError
 from r3jax.validation.files import read_bytes
 
 _MAX_BYTES = 4 << 30
-"""Models of cities are no larger."""
+"""Maximum size of a file; models of cities are smaller."""
 
 _LONGEST_NAME = 4096
 """Linux opens no longer path [bytes]."""
@@ -33,11 +33,11 @@ _LARGEST_ID = (1 << 63) - 1
 
 
 def read_binary(folder: Path) -> ColmapModel:
-    """Reads cameras.bin, images.bin and points3D.bin; rigs.bin and frames.bin say nothing more.
+    """Reads cameras.bin, images.bin and points3D.bin; rigs.bin and frames.bin are not needed.
 
     Raises:
-        FormatError: a file is missing, cut off, longer than its tables, or holds what no model
-            can: says which file and what.
+        FormatError: a file is missing, truncated, longer than its tables, or has invalid content;
+            names the file and the reason.
     """
     with naming(folder / "cameras.bin"):
         cameras = _cameras(_Cursor(read_bytes(folder / "cameras.bin", _MAX_BYTES)))
@@ -99,7 +99,7 @@ class _Cursor:
         return name
 
     def end(self) -> None:
-        """Refuses what follows behind the last row."""
+        """Refuses bytes after the last row."""
         left = len(self._data) - self._at
         if left:
             raise ForeignFileError(f"damaged: {left} bytes after the last row")

@@ -1,4 +1,4 @@
-"""A sparse model as COLMAP stores it, and what it means.
+"""COLMAP's sparse models, and the conversion of their poses.
 
 COLMAP's poses take points from the world to the camera, as a unit quaternion (Hamilton's, w first)
 and a translation; its camera axes are OpenCV's: x right, y down, z forward
@@ -17,7 +17,7 @@ from r3jax.formats.poses import MAX_DISTANCE, quaternion_of, rotation_of
 from r3jax.validation.errors import ForeignFileError
 
 NO_POINT = -1
-"""In place of a point's id, where a keypoint belongs to none."""
+"""Id of a keypoint without a point."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class ColmapImage:
     """World to camera, [3] float64."""
 
     keypoints: np.ndarray
-    """Where features were found, column and row [px], [k, 2] float64."""
+    """Positions of features, column and row [px], [k, 2] float64."""
 
     point_ids: np.ndarray
     """Id of each keypoint's point, or `NO_POINT`, [k] int64."""
@@ -56,7 +56,7 @@ class ColmapPoints:
     """[m, 3] uint8."""
 
     error: np.ndarray
-    """Mean reprojection error [px], negative where it was never computed, [m] float64."""
+    """Mean reprojection error [px], negative if not computed, [m] float64."""
 
     track_lengths: np.ndarray
     """Number of track elements of each point, [m] int64; they sum to t."""

@@ -1,4 +1,4 @@
-"""The field's own numbers of a reconstruction, as far as a model on disk has them.
+"""The usual quality measures of a reconstruction, as far as a model contains them.
 
 Shape symbols: m points; t track elements; n images.
 """

@@ -32,16 +32,16 @@ _DENSE = (".", "dense", "dense/0")
 """Where COLMAP's undistorter puts images, their model and the depth of its stereo."""
 
 _STEREO = ("geometric", "photometric")
-"""Depth that was checked between images goes first."""
+"""Geometrically consistent depth is preferred."""
 
 _MAX_EXTRA = 1.0
 _FOCAL_RATIOS = (0.1, 10.0)
 _SQUARE = 1.25
 """Pixels are square: no lens has focal lengths along x and y that differ by more than this."""
 _FAILED = 0.5
-"""Of a reconstruction with poses for fewer of the pictures that is said first."""
+"""Reconstructions with a smaller share of posed pictures are reported first."""
 _MOST_NAMED = 5
-"""Pictures without a model that are named."""
+"""Maximum number of pictures without a model to name."""
 _SERIES = ("SIMPLE_RADIAL", "RADIAL", "OPENCV")
 """COLMAP's mapper calls a lens bogus whose distortion, or whose focal length by its longer side,
 lies beyond; a model can still end with one when the last adjustment moves it. Terms of fisheyes
@@ -79,7 +79,7 @@ def find_stereo(path: Path) -> Path | None:
 
 
 def read_model(folder: Path) -> ColmapModel:
-    """Reads a model and checks that its parts fit together. Binary goes first, as in COLMAP.
+    """Reads a model and checks its consistency. Binary files are preferred, as in COLMAP.
 
     Raises:
         FormatError: says which file is wrong and why.
@@ -100,7 +100,7 @@ def read_model(folder: Path) -> ColmapModel:
 
 
 def read_colmap(path: Path | str, images: Path | str | None = None) -> PosedImages:
-    """Reads a capture that COLMAP has posed. Its images come in the order of their names.
+    """Reads a capture with poses from COLMAP. Images are in the order of their names.
 
     Args:
         path: the folder of the model, or the capture's, with the model in `sparse/0` or the like;
@@ -111,8 +111,8 @@ def read_colmap(path: Path | str, images: Path | str | None = None) -> PosedImag
             names, beside the model or in one of the three folders above it, that holds most.
 
     Raises:
-        FormatError: there is no model, or a file of it is damaged. Images that are missing are
-            noticed when they are read.
+        FormatError: there is no model, or a file of it is damaged. Missing images are reported when
+            they are read.
     """
     path = Path(path)
     dense = find_stereo(path)
@@ -264,7 +264,7 @@ def _gap(own: list[str], others: list[str]) -> tuple[str, str] | None:
 
 
 def _nowhere(names: list[str]) -> list[str]:
-    """Says which pictures join no model."""
+    """Describes pictures that belong to no model."""
     if not names:
         return []
     shown = ", ".join(names[:_MOST_NAMED])
@@ -273,10 +273,7 @@ def _nowhere(names: list[str]) -> list[str]:
 
 
 def _odd_lenses(model: ColmapModel) -> list[str]:
-    """Names a lens that cannot be true.
-
-    Then the poses and points, fitted with it, are not either.
-    """
+    """Names an implausible lens, which makes the poses and points unreliable."""
     odd = [
         f"camera {number} (focal lengths {lens.intrinsics[0]:.0f} and {lens.intrinsics[1]:.0f} px, "
         f"distortion {max(map(abs, lens.distortion.values()), default=0.0):.3g})"

@@ -1,1 +1,1 @@
-"""Captures as phone and tablet apps export them, folders and archives: one module for each."""
+"""Captures exported by phone and tablet apps, as folders and archives: one module per app."""

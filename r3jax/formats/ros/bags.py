@@ -1,8 +1,8 @@
 """Bags of ROS 1 and ROS 2, opened by `rosbags`: topics, and messages by topic and time.
 
 A bag is a file of ROS 1 (.bag), of ROS 2 (.mcap or .db3), or the folder that `ros2 bag record`
-writes (metadata.yaml). Whatever `rosbags` says of a damaged one becomes one kind of error, and a
-chunk is never unpacked to more than it says.
+writes (metadata.yaml). All errors of `rosbags` about damaged bags are converted to one type, and
+chunks are never unpacked to more than their declared size.
 """
 
 import bz2

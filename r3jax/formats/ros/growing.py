@@ -1,4 +1,4 @@
-"""A bag that is being recorded, as one that is read like any other.
+"""Reads a bag while it is being recorded.
 
 An MCAP can be followed, alone or in the folder that `ros2 bag record` makes (all its parts): its
 records are readable before the summary at its end is there. A recorder writes by chunks of about a
