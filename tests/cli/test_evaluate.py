@@ -105,7 +105,7 @@ def test_lpips_is_named_with_its_input_range(place, capsys):
         (["--views", "every:4"], [0, 4], "trained on 1 of these 2 views"),
         (["--views", "other"], [0, 1, 2], None),
         (["--views", "lounge"], [0, 1, 2, 3, 4, 5], "trained on 4 of these 6 views"),
-        (["--resolution", "32"], [0, 3], "trained at 48 px and is judged at 32 px"),
+        (["--resolution", "32"], [0, 3], "trained at 48 px and is evaluated at 32 px"),
     ],
 )
 def test_other_views_and_what_is_warned_of(place, capsys, words, views, warned):

@@ -79,7 +79,7 @@ def test_a_submission_stands_in_the_table_beside_a_policy(room, exported, tmp_pa
     words = ["benchmark", "--submission", str(exported), *JUDGING, "--out", str(tmp_path)]
     assert main(words) == 0
     captured = capsys.readouterr()
-    assert "3 of 3 images are those of the exploration, bit for bit" in captured.err
+    assert "3 of 3 images are bit-identical" in captured.err
     assert "random (submitted)" in captured.out
     assert "frontier" in captured.out
     records = [json.loads(line) for line in (tmp_path / CELLS).read_text().splitlines()]

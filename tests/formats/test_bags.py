@@ -285,7 +285,7 @@ def test_images_that_cannot_be_right_are_refused():
     whole = message(image(pixels, "rgb8", OPTICAL, 0))
     assert rgb_of(whole).shape == (4, 5, 3)
     for change, words in (
-        ({"encoding": "nv21"}, "encoding 'nv21' are not read: rgb8, bgr8"),
+        ({"encoding": "nv21"}, "unsupported image encoding 'nv21': rgb8, bgr8"),
         ({"encoding": "yuv422"}, "an odd number of columns"),
         ({"data": whole.data[:30]}, "5 x 4 pixels and 20 bytes a row has 30 bytes"),
         ({"step": 14}, "14 bytes a row"),

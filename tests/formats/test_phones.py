@@ -122,7 +122,7 @@ def test_other_folders_are_no_polycam(tmp_path):
 def test_an_archive_that_was_cut_off_says_so(tmp_path):
     path = tmp_path / "scan.zip"
     path.write_bytes(zipped(phones.polycam())[:-100])
-    with pytest.raises(FormatError, match=r"scan\.zip: this is no whole zip archive .*again"):
+    with pytest.raises(FormatError, match=r"scan\.zip: this is not a complete zip archive .*again"):
         open_capture(path)
 
 
@@ -302,7 +302,7 @@ def test_frames_of_a_video_come_by_number_in_any_order(tmp_path):
     for number in (0, 1, 2, 11, 5, 4, 4, 10, 0, 7):
         assert abs(video.frame(number).mean() - 20 * number) < 4
     for number in (-1, 12):
-        with pytest.raises(FormatError, match=f"12 frames, none of number {number}"):
+        with pytest.raises(FormatError, match=f"12 frames, but no frame {number}"):
             video.frame(number)
 
 

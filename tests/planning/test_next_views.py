@@ -134,7 +134,7 @@ def test_what_cannot_be_chosen_from_is_refused():
     ask = functools.partial(r3jax.next_views, state, grid, CAMERA, config=CONFIG)
     with pytest.raises(ValueError, match="k must be at least 1"):
         ask(0, poses=poses)
-    with pytest.raises(ValueError, match="25 views cannot be chosen from 24 poses"):
+    with pytest.raises(ValueError, match="cannot choose 25 views from 24 poses"):
         ask(25, poses=poses)
     with pytest.raises(ValueError, match=r"shape \[C, 4, 4\]"):
         ask(1, poses=poses[0])

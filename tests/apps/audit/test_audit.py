@@ -361,7 +361,7 @@ def test_a_model_without_images_is_audited_by_its_points(folder):
     found = audit(source, replace(FEW_VIEWS, views=0))
     assert found.diagnosis.share("noise") == 0.0
     assert "noise is not known" in method(found)[-1]
-    assert verdict(found)[0].startswith("None of the 8 pictures is there")
+    assert verdict(found)[0].startswith("None of the 8 pictures was found")
     (remark,) = picture_faults(found)["remarks"]
     assert "sharp" not in remark
     assert "where they say" not in remark

@@ -70,7 +70,7 @@ def test_without_any_image_only_depth_is_spoken_of(capture):
     source = opened(capture)
     assert not source.has_images
     assert source.remark is not None
-    assert source.remark.startswith("None of the 6 pictures is there")
+    assert source.remark.startswith("None of the 6 pictures was found")
     assert str(capture / "images" / "000.png") in source.remark
     found = find_faults(source, np.arange(6))
     assert found.left_out == {}

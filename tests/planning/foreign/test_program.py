@@ -150,7 +150,7 @@ def test_memory_has_a_limit():
 def test_memory_is_that_of_all_processes_and_what_they_share(code):
     if not IS_LINUX:
         pytest.skip("elsewhere nothing tells what processes share")
-    with pytest.raises(PolicyError, match=r"takes .* GiB .* its memory is 0\.25 GiB"):
+    with pytest.raises(PolicyError, match=r"takes .* GiB .* the limit is 0\.25 GiB"):
         asked(f"receive()\n{code}\nsend(kind='fine')", memory=0.25)
 
 
