@@ -56,7 +56,7 @@ class Options:
     """Of the images, which are 4 : 3 [px]."""
 
     hold_out: int = 8
-    """Every so many frames one is sharp and evenly exposed."""
+    """One of this number of frames is sharp and evenly exposed."""
 
     seed: int = 0
 

@@ -4,7 +4,7 @@
                every `EVERY` steps
     gavis      by the map of the photos chosen so far: the photo whose rays are known least
 
-Both begin with the same few photos, drawn by the seed. A photo's pixels are seen by nobody before
+Both begin with the same few photos, drawn by the seed. A photo's pixels are not seen before
 it is chosen; photos that are there need no path.
 
 Shape symbols: n photos on offer.
