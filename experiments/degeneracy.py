@@ -2,7 +2,7 @@
 
     python -m experiments.degeneracy --size smoke
 
-The cells are those of `experiments.replica_dense_views`. A view *revisits* if an earlier one was
+The cells are those of `experiments.paper views`. A view *revisits* if an earlier one was
 taken within 0.5 m of it and looked within 30 degrees of the same direction: the new image then
 shows little else. The paper shows its own planner trapped (its figure on Office3).
 """

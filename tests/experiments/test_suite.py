@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import degeneracy, quality_over_budget, replica_dense
+from experiments import degeneracy, paper
 from experiments.pages.artifacts import Origin
-from experiments.suite import HOUSE, Options, take_over
+from experiments.suite import HOUSE, take_over
 from r3jax.apps.benchmark.cells import Cell, Conditions, paths_of, snapshots_left
 from r3jax.apps.benchmark.record import read_records, write_record, write_records
 from r3jax.runs.writer import RunWriter
@@ -47,14 +47,15 @@ def test_a_table_of_equal_views_keeps_its_records_and_poses(tmp_path, monkeypatc
         for scene in ("flat", "office")
     ]
     made = [record(cell.policy, cell.scene, 0, 30) for cell in cells]
-    monkeypatch.setattr(replica_dense, "run_requests", lambda *_: (tmp_path / "a", cells, made))
+    monkeypatch.setattr(paper, "run_requests", lambda *_: (tmp_path / "a", cells, made))
     there = tmp_path / "there/some_flights"
     there.mkdir(parents=True)
     names = {f"{cell.policy}_{cell.scene}_0.jsonl" for cell in cells}
     for name in names:
         (there / name).write_text(name)
-    options = Options(kept=(tmp_path / "there/some_records.jsonl",), out=tmp_path / "out")
-    folder = replica_dense.make_tables(options, "some", "views")
+    monkeypatch.setitem(paper.NAMES, "views", "some")
+    options = paper.Options(kept=(tmp_path / "there/some_records.jsonl",), out=tmp_path / "out")
+    folder = paper.main(options)
     assert {path.name: path.read_text() for path in (folder / "some_flights").iterdir()} == {
         name: name for name in names
     }
@@ -81,7 +82,7 @@ def test_records_of_other_terms_find_no_place(tmp_path):
 
 
 def test_tables_hold_the_last_snapshot(records, tmp_path):
-    replica_dense.write_tables(tmp_path, "page", records, SOURCE)
+    paper.write_tables(tmp_path, "page", records, SOURCE)
     page = (tmp_path / "page.md").read_text()
     assert SOURCE.commit in page
     for kind in ("quality", "tails", "differences"):
@@ -92,13 +93,36 @@ def test_tables_hold_the_last_snapshot(records, tmp_path):
     (found,) = [r for r in rows if r["method"] == "r3" and r["metric"].startswith("PSNR")]
     assert float(found["flat"]) == pytest.approx(expected, abs=1e-6)
     without = [r for r in records if r["policy"] != "r3-pano"]
-    assert "differences" not in replica_dense.tables_of(without[1::2])
+    assert "differences" not in paper.tables_of(without[1::2])
+
+
+def test_what_captured_while_moving_has_tables_of_its_own(records):
+    moving = [
+        r | {"policy": "r3-ahead", "sensing": r["sensing"] | {"capture_every": 0.3}}
+        for r in records if r["policy"] == "r3"
+    ]  # fmt: skip
+    last = [r for r in [*records, *moving] if r["snapshot"] == "views:60"]
+    tables = paper.tables_of(last)
+    assert {row.labels[0] for row in tables["quality"].rows} == set(POLICIES)
+    assert {row.labels[0] for row in tables["quality-1"].rows} == {"r3-ahead"}
+    assert "differences-1" not in tables
+
+
+def test_the_size_of_the_paper_has_five_snapshots_in_the_flat():
+    requests = paper.requests_of(paper.Options(size="paper", unit="seconds"))
+    terms = [(r.scenes[0], r.policies, r.conditions) for r in requests]
+    assert [(scene, len(c.snapshots)) for scene, _, c in terms[:3]] == [
+        ("flat", 5), ("flat", 5), ("office", 3),
+    ]  # fmt: skip
+    assert {c.budget for *_, c in terms} == {"seconds:300"}
+    for scene, policies, conditions in terms:
+        assert (policies == ("r3-ahead",)) == bool(conditions.exploration_config().captures), scene
 
 
 def test_the_page_of_the_budget_shows_all_its_pictures(records, tmp_path):
-    quality_over_budget.write_page(tmp_path, records, SOURCE)
-    page = (tmp_path / "quality_over_budget.md").read_text()
-    for name in (*quality_over_budget.CURVES, "psnr_by_view"):
+    paper.write_curves(tmp_path, records, SOURCE)
+    page = (tmp_path / "curves.md").read_text()
+    for name in (*paper.CURVES, "psnr_by_view"):
         assert f"({name}.png)" in page
         assert (tmp_path / f"{name}.png").exists()
     assert {row["method"] for row in data_of(tmp_path / "areas.csv")} == set(POLICIES)
