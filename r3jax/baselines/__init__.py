@@ -1,1 +1,1 @@
-"""Policies of others that keep a radiance field while they plan: theirs, never ours."""
+"""Re-implemented policies of other papers, with and without a radiance field."""

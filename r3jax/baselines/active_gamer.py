@@ -1,4 +1,4 @@
-"""ActiveGAMER on our map: a pool of lattice views, ranked by how many of their pixels are empty.
+"""ActiveGAMER on r3jax's map: a pool of lattice views, ranked by their number of empty pixels.
 
 Candidates are kept between decisions (`Pool`). Those of stage 0 lie on a 1 m lattice,
 1.75 m above the floor, with 5 directions each; those of stage 1 on a 0.5 m lattice, 1.0 and 2.5 m
@@ -10,9 +10,10 @@ any distance, and the straight distance d to the candidate [m], over the candida
 A candidate with g < 0.5 % leaves the pool for good. A stage ends for good when every candidate
 that its pool ever held has left.
 
-What the paper leaves to its scenes' settings or to its simulator is decided here:
+Choices that the paper leaves to its scenes' settings or to its simulator:
 
-* Its candidates are free cells at a distance from matter; ours those in which the robot may stop.
+* Its candidates are free cells at a distance from surfaces; here, cells in which the robot may
+  stop.
 * It reads the true depth to leave out pixels that no view can fill, such as windows. Instead, a
   view that was chosen leaves the pool: what it did not show then, it will never show.
 * It scores the whole pool at every decision. Here at most `num_candidates` are scored: those with
@@ -56,7 +57,7 @@ from r3jax.planning.robot.travel import Travel
 from r3jax.scoring.config import ScoringConfig
 
 LEAST_GAIN = 0.005
-"""Share of the pixels below which a view is not worth taking."""
+"""Minimum share of empty pixels of a view."""
 
 _SLACK = 0.5
 """A candidate stands at most this far above or below its level [m]."""
@@ -271,7 +272,7 @@ def score_of(gain: np.ndarray, distance: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class ActiveGamer(GreedyPolicy):
-    """The emptiest view of a pool of lattice views, the farthest ones marked down."""
+    """The view with most empty pixels in a pool of lattice views, discounted by distance."""
 
     name = "active-gamer"
     source = "ActiveGAMER, Chen et al., CVPR 2025"

@@ -1,4 +1,4 @@
-"""Active-GS: views that show much of the unknown and much that is not believed yet, far away.
+"""Active-GS: views of unexplored space and of distant surfaces with low confidence.
 
     U = 1000 (visible unexplored cells / all cells) + mean over pixels of (1 - C) depth / d_max
     score = U / sum U - lambda2 L / sum L,    L the path length
@@ -40,7 +40,7 @@ from r3jax.planning.policy import Situation
 from r3jax.planning.robot.travel import Travel
 
 LOW_CONFIDENCE = 0.3
-"""Voxels with less than this are worth another look."""
+"""Voxels with less confidence than this count as regions of interest."""
 
 MANY = 5
 """A cell is a region of interest if it has more such voxels than this."""
@@ -280,7 +280,7 @@ def draw_views(
 
 @dataclass(frozen=True)
 class ActiveGS(GreedyPolicy):
-    """Views of unexplored space and of far surfaces seen too rarely, too slanted or from afar."""
+    """Views of unexplored space and of surfaces seen too rarely, too obliquely or too far away."""
 
     name = "active-gs"
     source = "Active-GS, Jin et al., RA-L 2025"

@@ -1,4 +1,4 @@
-"""Active-GS with the map that it was published with: discs, trained online, and their confidence.
+"""Active-GS with its published map: discs with confidence, trained online.
 
     C = clip(exp(1 - |mean view direction|) sum over frames of (1 - d / d_max) max(0, n . v), 0, 1)
     U = 1000 (visible unexplored cells / all cells) + mean over pixels of (1 - C) depth / d_max
@@ -137,7 +137,7 @@ def doubtful(online: OnlineMap, grid: OccupancyGrid) -> tuple[np.ndarray, np.nda
 
 @dataclass(frozen=True)
 class ActiveGSOnline(OnlinePolicy):
-    """Active-GS with discs that it trains while flying, as published, instead of voxels."""
+    """Active-GS with discs trained online, as published, instead of voxels."""
 
     name = "active-gs-online"
     source = "Active-GS, Jin et al., RA-L 2025, with its own map"

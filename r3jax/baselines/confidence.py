@@ -1,4 +1,4 @@
-"""How well Active-GS believes in each voxel: from where, how near and how squarely it was seen.
+"""Active-GS's confidence of each voxel, from directions, distances and angles of its observations.
 
     C = clip(exp(1 - ||mean_t v_t||) sum_t (1 - d_t / d_max) max(0, n . v_t), 0, 1)
 

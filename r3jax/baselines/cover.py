@@ -1,12 +1,12 @@
-"""COVER: look at what is known from directions in which it has not been seen.
+"""COVER: views of known surfaces from new directions.
 
     utility = 1000 U_G / cells of the grid  +  1 - mean over the covered pixels of c
     c       = max over the directions q_k from which the voxel was seen of (1 + <q_k, r>) / 2
 
-with r the direction from the pixel's voxel to the camera (NBV-Gym, CVPR 2026, which takes the
-view of the lowest mean). Ours are 64 direction bins a voxel instead of 128 a primitive, and
-visibility is the map's on both sides. The published rule knows no unknown space; so that it can
-explore at all it gets U_G, weighed as in Active-GS. Every table must say so.
+with r the direction from the pixel's voxel to the camera (NBV-Gym, CVPR 2026, which takes the view
+of the lowest mean). Ours are 64 direction bins a voxel instead of 128 a primitive, and visibility
+is the map's on both sides. The published rule knows no unknown space; so that it can explore, U_G
+is added, weighted as in Active-GS. Every table must mention this.
 
 Shape symbols: C candidates; h w pixels; N rows of the map; W words of bins.
 """
@@ -66,7 +66,7 @@ def _novelty_and_cells(view: PixelView) -> tuple[Float[Array, ""], Float[Array, 
 
 @dataclass(frozen=True)
 class Cover(GreedyPolicy):
-    """Views of known surface from new directions, by the mean over pixels; unknown space added."""
+    """Views of known surfaces from new directions (mean over pixels), plus unexplored cells."""
 
     name = "cover"
     source = "COVER of NBV-Gym, CVPR 2026, plus unexplored cells"

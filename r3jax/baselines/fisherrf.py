@@ -1,4 +1,4 @@
-"""FisherRF: the view whose pixels would move the parameters that are known least.
+"""FisherRF: the view with most information on the least certain parameters.
 
 Its rule for choosing among photos (JiangWenPL/FisherRF), here among the hundred candidates that
 all policies draw: arg max of the score, no path, no unknown space. The map
@@ -234,7 +234,7 @@ class FisherConfig(OnlineConfig):
 
 @dataclass(frozen=True)
 class FisherRF(OnlinePolicy):
-    """Views that tell most of the least known parameters of a map that it trains while flying."""
+    """Views with most information on the least certain parameters of a map trained online."""
 
     config: FisherConfig = field(default_factory=FisherConfig)
 

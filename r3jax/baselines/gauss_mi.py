@@ -1,4 +1,4 @@
-"""GauSS-MI: views of Gaussians that are not reliable yet, from one of four sides.
+"""GauSS-MI: views of Gaussians with low reliability, from one of four sides.
 
 Every Gaussian has four reliabilities r_k, for +x, +y, -x, -y of the world. A view along the unit
 vector u weighs them by w_k: |u_x| goes to +x or -x by its sign, |u_y| to +y or -y.
@@ -158,7 +158,7 @@ class GaussMIConfig(OnlineConfig):
 
 @dataclass(frozen=True)
 class GaussMI(OnlinePolicy):
-    """Views of Gaussians that no view from that side has shown to be right; trains a map."""
+    """Views of Gaussians with low reliability from their side, on a map trained online."""
 
     config: GaussMIConfig = field(default_factory=GaussMIConfig)
 

@@ -1,4 +1,4 @@
-"""GAVIS: views whose colors are least known, because no photo shows what they show from there.
+"""GAVIS: views with the highest entropy of colors, because no photo shows their content from there.
 
     utility = mean over the rays of a view of H(u)      (`unknown_share`, `unseen_share`)
     total   = utility / sum of utilities - lambda2 * path / sum of paths
@@ -261,7 +261,7 @@ class GavisConfig(PlannerConfig):
 
 @dataclass(frozen=True)
 class Gavis(GreedyPolicy):
-    """Views whose rays have the greatest entropy, by a visibility that depends on the direction."""
+    """Views with the highest entropy of rays, by visibility that depends on the direction."""
 
     config: GavisConfig = field(default_factory=GavisConfig)
 

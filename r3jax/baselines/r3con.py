@@ -75,7 +75,7 @@ class R3conConfig(PlannerConfig):
 
 @dataclass(frozen=True)
 class R3con(GreedyPolicy):
-    """The authors' own code: utility all round, then the direction; an adaptive path weight."""
+    """The rule of the authors' own code: position, then direction; adaptive path weight."""
 
     config: R3conConfig = field(default_factory=R3conConfig)
 

@@ -1,6 +1,6 @@
-"""What the loop may know of a world: a camera, a box, a start, and images from where it is.
+"""The loop's interface to a world: a camera, a box, a start, and images at the camera's poses.
 
-`NoisySimulator` makes the depth of another simulator as uncertain as a real sensor's.
+`NoisySimulator` adds depth noise to another simulator.
 """
 
 import hashlib
@@ -17,7 +17,7 @@ from r3jax.geometry.cameras import Camera
 
 @runtime_checkable
 class Simulator(Protocol):
-    """A world with a camera in it. No mesh, no ground truth, no second pose."""
+    """A world with a camera; gives no access to meshes or ground truth."""
 
     @property
     def camera(self) -> Camera:
@@ -31,9 +31,8 @@ class Simulator(Protocol):
 
     @property
     def start_pose(self) -> np.ndarray:
-        """Where the camera starts: `T_world_camera`, [4, 4] float64.
-
-        The ball of 0.5 m round it is promised to be free.
+        """Initial `T_world_camera` of the camera, [4, 4] float64. The ball of 0.5 m around it is
+        free.
         """
         ...
 
@@ -45,8 +44,8 @@ class Simulator(Protocol):
 class NoisySimulator:
     """Adds depth noise N(0, (sigma d)^2) to another simulator's frames.
 
-    That is the sensor of Active-GS (Jin et al., RA-L 2025), with sigma = 0.01. The noise is a
-    pure function of the seed and the pose: a frame that is rendered again is the same frame.
+    This is the sensor model of Active-GS (Jin et al., RA-L 2025), with sigma = 0.01. The noise is a
+    pure function of the seed and the pose, so that rendering a pose again gives the same frame.
     """
 
     def __init__(
@@ -56,8 +55,8 @@ class NoisySimulator:
 
         Args:
             simulator: renders the frames without noise.
-            relative_sigma: standard deviation of the depth as a share of the depth.
-            seed: of the noise, 0 or more.
+            relative_sigma: standard deviation of the depth noise, relative to the depth.
+            seed: random seed of the noise, 0 or more.
 
         Raises:
             ValueError: a share outside [0, 0.2], or a negative seed.
@@ -93,7 +92,7 @@ class NoisySimulator:
         frame = self.simulator.render(np.asarray(T_world_camera))
         depth = np.asarray(frame.depth)
         noise = self._generator(frame).standard_normal(depth.shape, dtype=np.float32)
-        # Cut at 4.5 sigma: a rare outlier must not turn a depth negative.
+        # Cut at 4.5 sigma: a rare outlier must not make a depth negative.
         factor = 1.0 + np.float32(self._sigma) * np.clip(noise, -4.5, 4.5)
         is_measured = (depth > 0.0) & np.isfinite(depth)
         noisy = np.where(is_measured, depth * factor, depth)

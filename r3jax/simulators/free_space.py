@@ -1,4 +1,4 @@
-"""What the evaluation protocol may know of a world: its free space, and images from anywhere.
+"""The evaluation protocol's access to a world: its free space, and images from any pose.
 
 The free space is sampled by nodes a tenth of a meter apart. A node is free if every surface is at
 least the margin away; the nodes that a camera can reach are those connected to its start. Two
@@ -49,10 +49,10 @@ _PIECE = 0.1
 
 
 class GroundTruth:
-    """The whole of a world, which the exploration loop never receives."""
+    """Full access to a world, which the exploration loop never gets."""
 
     def __init__(self, simulator: Simulator) -> None:
-        """Looks into the world behind `simulator`, noise or not.
+        """Accesses the world of a simulator, with or without noise.
 
         Raises:
             ValueError: the simulator has no mesh.
@@ -70,7 +70,7 @@ class GroundTruth:
 
     @property
     def scene_hash(self) -> str:
-        """SHA-256 of what is shown: geometry, colors, lamps."""
+        """SHA-256 of geometry, colors and lamps."""
         return self._scene_hash
 
     @functools.cached_property
@@ -86,8 +86,8 @@ class GroundTruth:
 
         Args:
             spacing: of the lattice along x, y, z [m].
-            margin: least distance to every surface [m], kept up to 0.2 mm, on the point and on the
-                nodes of a path to it.
+            margin: minimum distance to every surface [m], up to 0.2 mm, at the point and on a path
+                to it.
 
         Returns:
             Positions [n, 3] [m] float64 in lexicographic order, rounded to 0.1 mm.
@@ -117,7 +117,7 @@ class GroundTruth:
         return points[has_ceiling[1:]] if has_ceiling[0] else points
 
     def seen_share(self, poses: np.ndarray) -> np.ndarray:
-        """Measures which share of a 60 degree view at `poses` [V, 4, 4] shows a surface, [V]."""
+        """Computes the share of 60 degree views at `poses` [V, 4, 4] that shows a surface, [V]."""
         x = (np.arange(12) + 0.5) / 6.0 - 1.0
         x = x * math.tan(math.radians(30.0))
         cone = np.stack(np.broadcast_arrays(x[None], x[:, None], 1.0), axis=-1).reshape(-1, 3)
@@ -133,14 +133,14 @@ class GroundTruth:
     def room_along(
         self, paths: Sequence[np.ndarray], limit: float = math.inf
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Measures the least distances to a surface along paths, and where they occur.
+        """Computes the minimum distances to a surface along paths, and their positions.
 
         Sampled every 2 cm. Glass that no depth sensor sees (`Material.is_hole`) does not count:
         no explorer can detect it.
 
         Args:
             paths: waypoints [K, 3] [m] of each, one at least.
-            limit: a larger distance is not measured, which saves most of the time [m].
+            limit: larger distances are not computed, which saves most of the time [m].
 
         Returns:
             Distances [n] [m], 0 where a surface lies across the path and `inf` beyond the limit;

@@ -1,1 +1,1 @@
-"""How well models of the views collected so far would come out, from the map alone."""
+"""Predicts the quality of models of the views so far, from the map alone."""

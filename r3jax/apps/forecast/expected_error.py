@@ -1,13 +1,13 @@
-"""The error to expect of a view, pixel by pixel: how well it was seen times how hard it is.
+"""The expected error of a view, pixel by pixel: from renderability and difficulty.
 
-R says how well a surface was looked at, not how hard it is to render. With the difficulty C of a
-voxel (`difficulty`) and D = 1 - R, a pixel is expected to be off by
+R measures how well a surface was seen, not how hard it is to render. With the difficulty C of a
+voxel (`difficulty`) and D = 1 - R, the expected squared error of a pixel is
 
     e = a                        whatever is shown,
       + b C + c D^2 + d C D      where it shows a voxel,
       + f L                      where it shows none,
 
-L the mean square of the map's colors: what is not rendered is as wrong as it is bright. No
+L the mean square of the map's colors, because a missing pixel's error is its brightness. No
 coefficient is negative: the error never falls with difficulty, nor rises with R. The mean of e over
 a view is its expected squared error, and so its PSNR; with other coefficients it is 1 - SSIM. They
 were fitted on trained models (`docs/results/expected-error.md`).
@@ -50,12 +50,12 @@ AROUND = np.array(
 @checked(state=a_map)
 @jax.jit
 def voxel_difficulty(state: MapState) -> Float[Array, " N"]:
-    """Averages the color contrast between every voxel and those that touch it.
+    """Computes the color contrast between every voxel and its neighbors.
 
     The root of the mean, over the seen ones among its 26 neighbors and the three channels, of the
     squared difference of the mean colors: 0 for a plain wall, 0.1 to 0.2 for a bookshelf, at most
-    1. It needs no bytes of its own: maps that merge give that of the merged map. Rows that
-    describe no voxel, and voxels without a neighbor, have 0.
+    1. It needs no additional memory. Rows that describe no voxel, and voxels without a neighbor,
+      have 0.
     """
     return difficulty_of_rows(state, jnp.arange(state.capacity, dtype=jnp.int32))
 
@@ -93,23 +93,23 @@ REACH = 4.0
 hole when it is seen from afar."""
 
 TERMS = ("always", "unseen", "difficulty", "squared deficit", "difficulty x deficit")
-"""What the terms are called, in the order of the coefficients."""
+"""Names of the terms, in the order of the coefficients."""
 
 _PRIOR_BRIGHTNESS = 0.25
-"""Mean square color of a map that has seen nothing; counts as much as one voxel."""
+"""Mean square color of an empty map, with the weight of one voxel."""
 
 
 class Fit(NamedTuple):
-    """What was learned of one error."""
+    """The calibration of one error."""
 
     coefficients: tuple[float, ...]
     """Of the terms, each at least 0."""
 
     low: float
-    """Difference between truth and expectation that one view in ten falls below."""
+    """10th percentile of the difference between truth and expectation."""
 
     high: float
-    """The same that one view in ten exceeds."""
+    """90th percentile of the difference."""
 
 
 SQUARED = Fit((0.0, 0.141, 0.0377, 0.00696, 0.14), -5.41, 4.081)
@@ -123,7 +123,7 @@ _LEAST = 1e-5
 
 
 class ErrorImages(eqx.Module):
-    """The error to expect in each pixel of one view."""
+    """The expected error in each pixel of one view."""
 
     squared: Float[Array, "h w"]
     """Squared error, averaged over the channels."""
@@ -133,25 +133,25 @@ class ErrorImages(eqx.Module):
 
 
 class ExpectedError(eqx.Module):
-    """The error to expect of one view, and where four of five views come out."""
+    """The expected error of one view, with 80 % intervals."""
 
     psnr: Float[Array, ""]
     """PSNR [dB]."""
 
     psnr_low: Float[Array, ""]
-    """Nine of ten views are better [dB]."""
+    """10th percentile [dB]."""
 
     psnr_high: Float[Array, ""]
-    """One of ten views is better [dB]."""
+    """90th percentile [dB]."""
 
     ssim: Float[Array, ""]
     """SSIM."""
 
     ssim_low: Float[Array, ""]
-    """Nine of ten views are better."""
+    """10th percentile."""
 
     ssim_high: Float[Array, ""]
-    """One of ten views is better."""
+    """90th percentile."""
 
 
 @checked_view
@@ -173,8 +173,8 @@ def error_terms(
         camera: of the view.
         T_world_camera: its pose.
         config: range and size of the depth buffer.
-        difficulty: `voxel_difficulty` of the map, for who asks about many views of one map; None:
-            it is worked out for the voxels in view.
+        difficulty: `voxel_difficulty` of the map, if many views of one map are evaluated; None:
+            computed for the voxels in view.
     """
     config = ScoringConfig() if config is None else config
     far = eqx.tree_at(lambda c: c.max_range, config, REACH * config.max_range)
@@ -200,7 +200,7 @@ def _difficulty_in_pixels(
 
 
 def mean_square_color(state: MapState) -> Float[Array, ""]:
-    """Averages the squared colors of all voxels: the brightness of what is not known."""
+    """Averages the squared colors of all voxels, the assumed brightness of unknown pixels."""
     squares = jnp.where(state.present, jnp.mean(state.mean**2, axis=0), 0.0)
     number = jnp.sum(state.present, dtype=jnp.float32)
     return (jnp.sum(squares) + _PRIOR_BRIGHTNESS) / (number + 1.0)
@@ -234,8 +234,8 @@ def expected_error(
 ) -> ExpectedError:
     """Predicts PSNR and SSIM of one view from the means of `expected_error_images`.
 
-    What a model of the frames in the map would reach there, trained as the benchmark's are. It
-    ranks the views of a model; the level depends on the training. Written for one pose;
+    The values are those of a model of the frames in the map, trained like the benchmark's models.
+    They rank the views of a model; their level depends on the training. Written for one pose;
     `jax.vmap` it over many:
 
         hard = r3jax.voxel_difficulty(map_state)

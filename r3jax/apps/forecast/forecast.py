@@ -1,14 +1,12 @@
-"""A forecast of the image quality throughout a place, from the map alone; a goal ends a run.
+"""Predicts the image quality throughout a scene, from the map alone; a goal ends a run.
 
-While a place is being explored, its free space is not known: what is known to be free is too
-little, and a forecast over it alone would be content with the first room. So the views whose
-quality is forecast stand wherever the space is free or unexplored, connects to what is known to be
-free, and keeps its distance from everything known to be occupied. That is too much while much is
-unexplored (the forecast is then too low), and settles as the place becomes known.
+During exploration the free space is only partly known, and a forecast over known free space would
+be satisfied with the first room. So the forecast uses views in all space that is free or
+unexplored, connected to known free space, and at a distance from everything occupied. While much is
+unexplored this space is too large and the forecast too low; it converges as the scene becomes
+known. Views are like those of the benchmark's test sets: in six directions along the axes.
 
-The views are those of the benchmark's test sets: in one of six directions, along the axes.
-
-Along a recorded run, forecasts say how many more views a decibel would take.
+Along a recorded run, forecasts estimate the number of further views for one decibel.
 
 Shape symbols: V views; X Y Z cells.
 """
@@ -42,10 +40,10 @@ from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.renderability import term_images
 
 MARGIN = 0.3
-"""Least distance of the views to what is occupied [m], as in the benchmark's test sets."""
+"""Minimum distance of the views to occupied cells [m], as in the benchmark's test sets."""
 
 _NUM_DRAWN = 1 << 14
-"""Positions drawn over the scene's box; most of them lie in walls or outside."""
+"""Number of positions drawn in the scene's box; most of them are in walls or outside."""
 
 _FACES = ndimage.generate_binary_structure(3, 1)
 
@@ -93,7 +91,7 @@ def _sequence() -> np.ndarray:
 
 
 NUM_VIEWS = 96
-"""Views that a forecast looks at; enough for a percentile to within a few hundredths."""
+"""Number of views of a forecast; enough for a percentile to within a few hundredths."""
 
 _LEAST_SHOWN = 0.5
 """A view that shows less than this share of surface and nothing unexplored looks into the void

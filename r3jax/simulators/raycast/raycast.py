@@ -1,8 +1,8 @@
 """A simulator that casts rays into a textured triangle mesh.
 
-One ray through each pixel's center gives depth and color. Where neighboring pixels show
-different faces in different colors, more rays inside the pixel smooth the edge: elsewhere the
-texture filter already does. A mirror's share of the color comes from one reflected ray.
+One ray through each pixel's center gives depth and color. Where neighboring pixels show different
+faces in different colors, further rays inside the pixel smooth the edge; elsewhere the texture
+filter suffices. Mirrors use one reflected ray.
 
 Shape symbols: H W image size; n rays; F faces.
 """
@@ -24,7 +24,7 @@ from r3jax.simulators.raycast.rays import Hits, TriangleScene
 from r3jax.simulators.raycast.shading_tables import build_shading_tables
 from r3jax.simulators.world import World
 
-# A rotated grid: nearly level and nearly upright edges, the ones that show, get four steps.
+# A rotated grid: nearly horizontal and vertical edges, the most visible ones, get four steps.
 _SUBPIXELS = np.array([[0.125, 0.375], [-0.375, 0.125], [-0.125, -0.375], [0.375, -0.125]])
 
 
@@ -46,12 +46,12 @@ class RaycastSimulator:
         """Prepares the search tree, the textures and the start.
 
         Args:
-            world: what is there.
+            world: the scene.
             camera: intrinsics; None: 512x512 pixels, 60 degrees.
-            max_range: z-depth beyond which the depth sensor sees nothing [m]; None: unlimited.
-                Colors have no such limit.
+            max_range: range of the depth sensor in z [m]; None: unlimited. Colors have no such
+                limit.
             start_pose: `T_world_camera` at the start; None: the world's own, or a search.
-            cull_back_faces: look through faces seen from behind, as Habitat does.
+            cull_back_faces: do not render back faces, like Habitat.
             supersample: extra rays in a pixel on an edge, 0 to 4.
             lighting: False shows every surface in its own color: no lamps, no mirrors.
             seed: of the search for a start.
@@ -89,7 +89,7 @@ class RaycastSimulator:
 
     @property
     def content_hash(self) -> str:
-        """SHA-256 of what is shown: of the world, and that back faces are not if so."""
+        """SHA-256 of the world, and of the setting for back faces."""
         known = self.world.content_hash
         return hashlib.sha256(f"culled {known}".encode()).hexdigest() if self._cull else known
 
@@ -98,7 +98,7 @@ class RaycastSimulator:
         """`T_world_camera` at the start, [4, 4] float64; searched for on first use.
 
         Raises:
-            ValueError: no place in the mesh has half a meter free all round.
+            ValueError: no position in the mesh has half a meter of free space around it.
         """
         if self._start is None:
             self._start = start.find_start(self._bounds, self._scene, self._distance, self._seed)
@@ -117,7 +117,7 @@ class RaycastSimulator:
         max_range: float | int | None,
         cull_back_faces: bool | None = None,
     ) -> "RaycastSimulator":
-        """Returns the same world in the same light through another camera; nothing is built again.
+        """Returns a simulator of the same world with another camera; shares all data.
 
         Args:
             camera: its intrinsics.
@@ -136,7 +136,7 @@ class RaycastSimulator:
     def clearance(self, points: np.ndarray) -> np.ndarray:
         """Measures the distances [n] of `points` [n, 3] to the mesh [m].
 
-        For tests only: the exploration loop never has them.
+        For tests only; the exploration loop has no access.
         """
         return self._distance(np.asarray(points, dtype=np.float64))
 

@@ -1,4 +1,4 @@
-"""What a scene may be called, known without opening it."""
+"""Names of scenes, checked without opening them."""
 
 from pathlib import Path
 

@@ -28,7 +28,7 @@ __all__ = ["describe", "open_scene", "open_world", "outside_scenes", "scene_hash
 
 
 def scene_names() -> list[str]:
-    """Lists the embedded scenes; `outside_scenes` lists what else can be opened."""
+    """Lists the embedded scenes; `outside_scenes` lists other kinds."""
     return list(procedural.names())
 
 
@@ -47,12 +47,10 @@ def open_world(spec: str, up: str | None = None, scale: float | int = 1.0) -> Wo
     """Opens the triangles and materials behind a scene's name.
 
     Args:
-        spec: the name of an embedded scene, or one of `outside_scenes`. Of a Habitat scene this is
-            the mesh that it shows.
+        spec: the name of an embedded scene, or one of `outside_scenes`. For a Habitat scene this is
+            its mesh.
         up: vertical axis of a mesh file, "y" or "z"; None: y for glTF, z for everything else.
-        scale: meters in a unit of a mesh file.
-
-    Raises:
+        scale: unit of a mesh file [m]. Raises:
         ValueError: the scene is unknown, `up` or `scale` is given for a scene that is no mesh
             file, or the mesh file is refused (see `load_world`) or missing.
     """
@@ -84,18 +82,17 @@ def open_scene(
 ) -> Simulator:
     """Opens a scene for exploration.
 
-    The first one on a machine also starts a process that compiles the kernels for CPUs, which
-    an exploration will need.
+    The first one on a machine also starts a process that compiles the CPU kernels.
 
     Args:
         spec: the name of an embedded scene, or one of `outside_scenes`.
         up: vertical axis of a mesh file, "y" or "z"; None: y for glTF, z for everything else.
-        scale: meters in a unit of a mesh file: 0.001 for one in millimeters.
-        cull_back_faces: look through faces seen from behind, as Habitat always does.
+        scale: unit of a mesh file [m]: 0.001 for millimeters.
+        cull_back_faces: do not render back faces, like Habitat.
         camera: intrinsics; None: 512x512 pixels, 60 degrees.
-        noise: standard deviation of the depth as a share of the depth; 0: exact depth.
-        seed: of the noise, and of the search for a start where the scene has none.
-        max_range: reach of the depth sensor [m]; None: unlimited.
+        noise: standard deviation of the depth noise, relative to the depth; 0: exact depth.
+        seed: random seed of the noise, and of the search for a start if the scene has none.
+        max_range: range of the depth sensor [m]; None: unlimited.
         start_pose: `T_world_camera` at the start; None: the scene's own, or a search.
 
     Raises:
@@ -119,7 +116,7 @@ def open_scene(
         )
     else:
         if problem := missing_for_machine_code():
-            raise ImportError(f"{spec}: scenes are drawn by machine code, but {problem}")
+            raise ImportError(f"{spec}: scenes are rendered by machine code, but {problem}")
         simulator = RaycastSimulator(
             open_world(spec, up, scale),
             camera,
@@ -132,9 +129,7 @@ def open_scene(
 
 
 def scene_hash(simulator: Simulator) -> str:
-    """Hashes by SHA-256 what a simulator from `open_scene` shows.
-
-    That is geometry, colors and lamps, and the renderer.
+    """Computes the SHA-256 of a simulator's content: geometry, colors, lamps, and the renderer.
 
     Raises:
         ValueError: the simulator does not come from `open_scene`.
