@@ -31,9 +31,7 @@ class Simulator(Protocol):
 
     @property
     def start_pose(self) -> np.ndarray:
-        """Initial `T_world_camera` of the camera, [4, 4] float64. The ball of 0.5 m around it is
-        free.
-        """
+        """Initial `T_world_camera`, [4, 4] float64, with a free ball of 0.5 m around it."""
         ...
 
     def render(self, T_world_camera: np.ndarray) -> Frame:
