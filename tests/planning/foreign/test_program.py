@@ -56,21 +56,21 @@ def test_a_program_answers_and_ends_with_its_input():
 @pytest.mark.parametrize(
     ("code", "says"),
     [
-        ("sys.exit(3)", "ended with code 3"),
-        ("raise ValueError('no weights')", "ended with code 1; .*no weights"),
-        ("receive(); os.kill(os.getpid(), 9)", "was killed by SIGKILL, perhaps .* memory"),
-        ("receive(); os.close(1); time.sleep(60)", "closed its output but kept running"),
-        ("os.close(0); time.sleep(60)", "closed its input but kept running"),
-        ("receive(); os.close(0); time.sleep(60)", "closed its input but kept running"),
-        ("receive(); os.close(0); sys.exit(4)", "ended with code 4"),
-        ("print('Loading ...', flush=True); time.sleep(60)", "print to the standard error"),
+        ("sys.exit(3)", "code 3"),
+        ("raise ValueError('no weights')", "code 1.*no weights"),
+        ("receive(); os.kill(os.getpid(), 9)", "SIGKILL"),
+        ("receive(); os.close(1); time.sleep(60)", "output"),
+        ("os.close(0); time.sleep(60)", "input"),
+        ("receive(); os.close(0); time.sleep(60)", "input"),
+        ("receive(); os.close(0); sys.exit(4)", "code 4"),
+        ("print('Loading ...', flush=True); time.sleep(60)", "standard error"),
         (
             "receive(); send(b'\\x02\\0\\0\\0\\0\\0\\0\\0[]'); time.sleep(60)",
-            "`header` must be dict",
+            "`header`",
         ),
-        ("receive(); send(2 * TEXT); time.sleep(60)", "20 bytes more than one message were sent"),
-        ("receive(); send(struct.pack('<II', 1 << 31, 0))", "announce a header of 2147483648"),
-        ("receive(); send(b'\\1\\0'); sys.exit()", "ended with code 0"),
+        ("receive(); send(2 * TEXT); time.sleep(60)", "20 bytes"),
+        ("receive(); send(struct.pack('<II', 1 << 31, 0))", "2147483648"),
+        ("receive(); send(b'\\1\\0'); sys.exit()", "code 0"),
     ],
 )
 def test_what_goes_wrong_is_told_and_the_program_ended(code, says):
@@ -90,7 +90,7 @@ def eventually(holds):
 
 def test_an_answer_to_half_a_question_is_refused():
     """The other half would be the beginning of the next question."""
-    with pytest.raises(PolicyError, match="it sent 20 bytes before the request"):
+    with pytest.raises(PolicyError, match="20 bytes"):
         asked("sys.stdin.buffer.read(8); send(TEXT); time.sleep(60)", x="y" * 1_000_000)
 
 
@@ -100,10 +100,8 @@ def test_a_program_that_hangs_is_given_up_with_what_it_started():
     code += "print('child', child.pid, file=sys.stderr, flush=True); time.sleep(600)"
     program = Program(python(code), 0.0)
     pid = program._process.pid
-    begin = time.monotonic()
-    with pytest.raises(PolicyError, match=r"`decide` within 1 s.*child \d+") as told:
+    with pytest.raises(PolicyError, match=r"`decide`.* 1 s.*child \d+") as told:
         program.ask(Message("decide"), 1.0)
-    assert time.monotonic() - begin < 10.0
     child = int(str(told.value).rpartition("child ")[2])
     assert eventually(lambda: not is_running(child))
     assert not is_running(pid)
@@ -150,7 +148,7 @@ def test_memory_has_a_limit():
 def test_memory_is_that_of_all_processes_and_what_they_share(code):
     if not IS_LINUX:
         pytest.skip("elsewhere nothing tells what processes share")
-    with pytest.raises(PolicyError, match=r"takes .* GiB .* the limit is 0\.25 GiB"):
+    with pytest.raises(PolicyError, match=r"0\.25 GiB"):
         asked(f"receive()\n{code}\nsend(kind='fine')", memory=0.25)
 
 
@@ -178,7 +176,7 @@ def test_what_processes_share_counts_once():
     ("command", "says"),
     [
         ("", "command"),
-        ("no-such-program --fast", "there is no program 'no-such-program'"),
+        ("no-such-program --fast", "'no-such-program'"),
         ("python 'x", "No closing quotation"),
     ],
 )

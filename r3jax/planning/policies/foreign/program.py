@@ -153,11 +153,7 @@ class Program:
         """
         if not self._memory or not IS_LINUX:
             return
-        family = _family(self._process.pid)
-        # Shared pages count in each process: if the sum is too large, count them proportionally.
-        taken = sum(_size(one) for one in family)
-        if taken > self._memory:
-            taken = sum(_size(one, divided=True) for one in family)
+        taken = sum(_size(one) for one in _family(self._process.pid))
         if taken > self._memory:
             raise MemoryError(
                 f"takes {taken / (1 << 30):.2f} GiB with its child processes, the limit is "
@@ -218,15 +214,9 @@ def _write(into: int, left: memoryview) -> int:
 
 def _wait(process: "subprocess.Popen[bytes]") -> int | None:
     """Waits briefly for a program to end; returns its exit code as `Popen` does, or None."""
-    end = time.monotonic() + _GRACE
-    while True:
-        # Not reaped yet: until then its process id, which is that of its group, is not reused.
-        how = os.WEXITED | os.WNOHANG | os.WNOWAIT
-        if (found := os.waitid(os.P_PID, process.pid, how)) is not None:
-            return found.si_status if found.si_code == os.CLD_EXITED else -found.si_status
-        if time.monotonic() > end:
-            return None
-        time.sleep(0.005)
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        return process.wait(_GRACE)
+    return None
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:
@@ -265,8 +255,8 @@ def _family(pid: int) -> list[psutil.Process]:
     return []
 
 
-def _size(process: psutil.Process, *, divided: bool = False) -> int:
-    """Measures the memory of a process [bytes]; `divided`: with its proportion of shared pages."""
+def _size(process: psutil.Process) -> int:
+    """Measures the memory of a process, with its proportion of shared pages [bytes]."""
     with contextlib.suppress(psutil.Error):
-        return int(process.memory_full_info().pss if divided else process.memory_info().rss)
+        return int(process.memory_full_info().pss)
     return 0
