@@ -121,22 +121,6 @@ def test_a_damaged_path_is_named(folder, damage):
         read_camera_path(folder / "bad.json")
 
 
-def test_no_flipped_bit_of_a_path_is_believed(folder):
-    path = folder / "flipped.json"
-    write_camera_path(path, np.stack([np.eye(4)] * 2), CAMERA)
-    data, whole = path.read_bytes(), read_camera_path(path)
-    for bit in range(5, 8 * len(data), 499):
-        flipped = bytearray(data)
-        flipped[bit // 8] ^= 1 << bit % 8
-        path.write_bytes(flipped)
-        try:
-            found = read_camera_path(path)
-        except FormatError:
-            continue
-        np.testing.assert_array_equal(found.poses, whole.poses)
-        assert found.lenses == whole.lenses
-
-
 def test_other_files_are_no_camera_paths(folder):
     write_camera_path(folder / "good.json", np.eye(4)[None], CAMERA)
     assert is_camera_path(folder / "good.json")

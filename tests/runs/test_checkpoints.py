@@ -6,7 +6,6 @@ import subprocess
 import sys
 import threading
 
-import jax
 import numpy as np
 import orbax.checkpoint as ocp
 import pytest
@@ -145,33 +144,6 @@ def test_a_folder_that_is_a_link_is_refused(tmp_path):
     assert (tmp_path / "victim" / "photos").exists()
 
 
-def flip(path, position):
-    """Turns one bit of a file round; the second time it is as it was."""
-    data = bytearray(path.read_bytes())
-    data[position // 8] ^= 1 << position % 8
-    path.write_bytes(data)
-
-
-def test_every_flipped_bit_is_found_or_without_effect(tmp_path):
-    writer = CheckpointWriter(tmp_path)
-    writer.save(0, TABLES, wait=True)
-    writer.close()
-    whole, refused = load_checkpoint(tmp_path, 0), 0
-    rng = np.random.default_rng(0)
-    files = sorted(path for path in (tmp_path / "000000").rglob("*") if path.is_file())
-    for path in files * 8:
-        position = int(rng.integers(8 * path.stat().st_size))
-        flip(path, position)
-        try:
-            found = load_checkpoint(tmp_path, 0)
-        except RunError:
-            refused += 1
-        else:
-            jax.tree.map(np.testing.assert_array_equal, found, whole)
-        flip(path, position)
-    assert refused >= 7 * len(files)  # all but blanks in the list of hashes
-
-
 def test_a_checkpoint_without_hashes_is_read(tmp_path):
     """As earlier versions wrote them."""
     with ocp.PyTreeCheckpointer() as checkpointer:
@@ -187,7 +159,7 @@ def test_a_refused_write_is_told_at_the_next_call(tmp_path, monkeypatch):
     monkeypatch.setattr(ocp.PyTreeCheckpointer, "save", full)
     writer = CheckpointWriter(tmp_path / "c")
     writer.save(0, TABLES)
-    with pytest.raises(OSError, match=r"No space left on device: .*000000"):
+    with pytest.raises(OSError, match="000000"):
         writer.wait()
     writer.close()
 

@@ -117,13 +117,13 @@ def test_settings_are_the_runs_own(run):
     assert float(config.scoring.lambda1) == 3.0
     assert (config.num_candidates, config.num_frontier) == (12, 4)
     header = dataclasses.replace(run.header, policy={"name": "r3", "settings": {"novel": 1}})
-    with pytest.raises(RunError, match=r"setting of the policy: .*novel"):
+    with pytest.raises(RunError, match="novel"):
         planner_config_of(dataclasses.replace(run, header=header))
 
 
 def test_a_merged_run_is_refused(run):
     header = dataclasses.replace(run.header, parent={"merged": ["a", "b"], "merged_views": [2, 8]})
-    with pytest.raises(RunError, match="merged from runs"):
+    with pytest.raises(RunError, match="merged"):
         next(explain_run(dataclasses.replace(run, header=header)))
 
 
