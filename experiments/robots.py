@@ -112,11 +112,21 @@ class Plan:
         return (labels == here) & (here > 0)
 
 
+_SURFACES: dict[str, np.ndarray] = {}
+
+
+def surface_of(world: World) -> np.ndarray:
+    """Points on a mesh, one per square centimeter: the thinnest leg of a chair gets dozens."""
+    if world.name not in _SURFACES:
+        _SURFACES.clear()  # one world at a time: a house has four million points
+        mesh = trimesh.Trimesh(world.vertices, world.faces, process=False)
+        _SURFACES[world.name], _ = trimesh.sample.sample_surface(mesh, int(mesh.area * 1e4), seed=0)
+    return _SURFACES[world.name]
+
+
 def plan_of(world: World, floor: float, low: float, high: float) -> Plan:
     """Draws everything of a mesh that lies between two heights above the floor [m]."""
-    mesh = trimesh.Trimesh(world.vertices, world.faces, process=False)
-    # One point per square centimeter: the thinnest leg of a chair gets dozens.
-    points, _ = trimesh.sample.sample_surface(mesh, int(mesh.area * 1e4), seed=0)
+    points = surface_of(world)
     z = points[:, 2] - floor
     points = points[(z > max(low, LOW)) & (z < high)]
     origin = world.bounds[0, :2]
@@ -179,16 +189,20 @@ def open_bounds(world: World, floor: float) -> np.ndarray:
     return bounds
 
 
+def pose_of(robot: Robot, place: np.ndarray, floor: float) -> np.ndarray:
+    """Pose of the camera of a robot that stands at a place [2] and faces along x, [4, 4]."""
+    tilt = np.radians(robot.tilt)
+    eye, ahead = (*place, floor + robot.height), (np.cos(tilt), 0.0, np.sin(tilt))
+    return np.asarray(pose_along(np.array(eye, np.float32), np.array(ahead, np.float32)), float)
+
+
 def drive(
     world: World, robot: Robot, settings: dict[str, Any], decisions: int, *, floor: float = 0.0,
     policy: str = "r3-pano", seed: int = 0,
 ) -> dict[str, Any]:  # fmt: skip
     """Drives one robot through a world; what it visited, and what it touched."""
     plan = plan_of(world, floor, robot.low, robot.height)
-    x, y = plan.center(start_of(plan, robot.footprint))
-    tilt = np.radians(robot.tilt)
-    eye, ahead = (x, y, floor + robot.height), (np.cos(tilt), 0.0, np.sin(tilt))
-    pose = np.asarray(pose_along(np.array(eye, np.float32), np.array(ahead, np.float32)), float)
+    pose = pose_of(robot, plan.center(start_of(plan, robot.footprint)), floor)
     inner = RaycastSimulator(world, robot.camera, start_pose=None, max_range=5.0)
     simulator = NoisySimulator(inner, 0.01, seed)
     chosen = r3jax.make_policy(policy, num_candidates=60, num_frontier=20, **settings)
@@ -196,9 +210,10 @@ def drive(
     planner = r3jax.start(robot.camera, open_bounds(world, floor), chosen, starts=[pose],
                           config=config)  # fmt: skip
     paths, goals, outcomes, seconds = [pose[None, :3, 3]], [], [], []
-    reason = ""
+    reason, views = "", [[*pose[:3, 3].round(3).tolist(), *pose[:3, 2].round(3).tolist()]]
     for key in jax.random.split(jax.random.key(seed), decisions):
         planner = r3jax.observe(planner, simulator.render(pose.astype(np.float32)))
+        jax.block_until_ready(planner)  # the frame is in the map before the clock starts
         begin = time.perf_counter()
         decision, planner, info = r3jax.decide(planner, pose, key)
         seconds.append(time.perf_counter() - begin)
@@ -209,6 +224,7 @@ def drive(
         paths.append(along(decision.waypoints))
         goals.append(decision.length)
         pose = decision.T_world_camera
+        views.append([*pose[:3, 3].round(3).tolist(), *pose[:3, 2].round(3).tolist()])
     track = np.concatenate(paths)
     reachable = plan.reachable(robot.footprint, track[0])
     visited = near_path(reachable, plan.pixel(track))
@@ -234,6 +250,7 @@ def drive(
         # Half a diagonal of a pixel is what the plan itself may be wrong by.
         "collides": bool(nearest < robot.footprint - 0.75 * PIXEL),
         "decide_median": float(np.median(seconds)),
+        "views": views,
         "track": track[:: max(len(track) // 800, 1)].round(3).tolist(),
     }
 
@@ -252,7 +269,8 @@ def robots(kind: str) -> list[Robot]:
                for lens in ("40x30", "90x74")]  # fmt: skip
     bodies = [Robot(height=h, body=b) for h, b in ((0.6, 0.0), (0.9, 0.4))]
     if kind == "few":
-        return [Robot(height=0.3), Robot(height=0.6), Robot(height=0.9, tilt=-20.0)]
+        return [Robot(height=0.3), Robot(height=0.6), Robot(height=0.9, tilt=-20.0),
+                Robot(height=1.5, tilt=-30.0, lens="40x30")]  # fmt: skip
     return [*middle, *tilted, *lenses, *corners, *bodies]
 
 

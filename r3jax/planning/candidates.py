@@ -168,11 +168,12 @@ def draw_positions(
     # Of the masked grid: a boundary that cannot be crossed is not a frontier.
     targets = np.asarray(frontier(scoring_grid))
     positions, aims = region_of_interest(travel, targets, config.num_frontier, key=frontier_key)
-    # The rest are local positions, so that every decision scores the same number.
-    local = local_random(
-        travel, config.num_candidates - len(positions), config.radius, key=local_key
-    )
-    # Local views have no target cell; NaN keeps the rows of both arrays aligned.
+    # What the frontier leaves goes to local positions: every decision scores the same number.
+    num = config.num_candidates - len(positions)
+    new = new_places(travel, num // 2, key=local_key)
+    local = local_random(travel, num - len(new), config.radius, key=local_key)
+    local = np.concatenate([new, local])
+    # Local views have no aim; NaN keeps the two arrays row by row alike.
     aims = np.concatenate([aims, np.full_like(local, np.nan)])
     return np.concatenate([positions, local]), aims
 
@@ -209,6 +210,22 @@ def local_random(travel: Travel, num: int, radius: float = 0.5, *, key: Array) -
     if not travel.safe[travel.start_cell]:
         positions[is_own[chosen]] = travel.start
     return positions
+
+
+def new_places(travel: Travel, num: int, *, key: Array) -> np.ndarray:
+    """Draws up to `num` positions from the nearest columns where the robot has not been.
+
+    Returns:
+        [n, 3] float64 [m]; none where it does not matter (`Travel.fresh`).
+    """
+    if travel.fresh is None:
+        return np.zeros((0, 3))
+    rng = host_generator(jax.random.fold_in(key, 1))
+    cells = np.argwhere(travel.goals & travel.fresh[:, :, None])
+    if not len(cells):
+        return np.zeros((0, 3))
+    near = np.argsort(travel.cost[tuple(cells.T)], kind="stable")[:_NEIGHBORS]
+    return travel.stops(cells[near[rng.integers(len(near), size=num)]])
 
 
 def region_of_interest(

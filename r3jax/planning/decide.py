@@ -33,7 +33,7 @@ from r3jax.planning.robot.explorable import mask_unexplorable
 from r3jax.planning.robot.limits import Limits
 from r3jax.planning.robot.motion import Motion
 from r3jax.planning.robot.room import room_for
-from r3jax.planning.robot.travel import Travel, plan_travel
+from r3jax.planning.robot.travel import NEW_PLACE, Travel, fresh_columns, plan_travel
 from r3jax.scoring.explain import Explanation, explain_view
 from r3jax.scoring.utility import visible_unexplored
 
@@ -41,8 +41,11 @@ MAX_FAILED_LOOKS = 3
 """A cell still unexplored after this many views that should have shown it is given up: it lies
 behind a window, where the depth sensor fails, or where hits and passes cancel out."""
 
-NEW_PLACE, NEW_DIRECTION = 1.0, 45.0
-"""A view is new if it is this far from all others [m], or turned by this angle [degrees]."""
+NEW_DIRECTION = 45.0
+"""A view turned by so much from all others at its place is a new one [degrees]."""
+
+OLD_PLACE = 0.5
+"""Novelty of a new view at a place where the robot has been, against one at a new place."""
 
 SHUT_IN_VIEWS, SHUT_IN_STEP = 6, 0.3
 """A robot is shut in if its latest views lie within this distance [m] and no path leads farther."""
@@ -282,9 +285,11 @@ def decide(
     utilities = utilities | {"path": path}
     gain = utilities.get("utility")
     if stands(config.motion) and state.taken is not None and gain is not None:
-        # Such a robot has few views of a place: unexplored cells that none of them shows would keep
-        # it there.
-        utilities["utility"] = gain * novelty(candidates, state.taken)
+        # Camera and floor tie such a robot to few views of a place: what they cannot show would
+        # draw it to where it is for as long as it runs.
+        new = novelty(candidates, state.taken)
+        is_fresh = travel.is_fresh(candidates.position)
+        utilities["utility"] = gain * np.where(is_fresh, 1.0, OLD_PLACE * new)
     utilities = utilities | {"total": rule.weigh(utilities)}
 
     with stopwatch.part("travel"):
@@ -376,10 +381,13 @@ def travel_of(
     if body.heights is None:
         return plan_travel(grid, position, body.needed, trail, heights)
     present = np.asarray(map_state.present)
-    voxels = np.asarray(map_state.center).T[present].astype(np.float64)
+    voxels = np.asarray(map_state.center)[:, present].T.astype(np.float64, order="C")
     size = float(map_state.voxel_size)
-    room = room_for(body, grid, voxels, size, pose, state.camera, trail)
-    return plan_travel(grid, position, trail=trail, heights=heights, room=room)
+    stood = None if state.taken is None else state.taken[:, :2].astype(np.float64)
+    room = room_for(body, grid, voxels, size, pose, state.camera, trail, stood)
+    travel = plan_travel(grid, position, trail=trail, heights=heights, room=room)
+    places = position[None, :2] if stood is None else np.concatenate([position[None, :2], stood])
+    return replace(travel, fresh=fresh_columns(travel, trail, places))
 
 
 def explain_path(

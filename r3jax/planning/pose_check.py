@@ -41,6 +41,10 @@ _MAX_OF_FITTING = 0.25
 _SUSPECTED = 3
 """Pairs in a row before another convention is suggested: walls of two rooms may fit by chance."""
 
+_MAX_APART = 1.0
+"""Cameras farther apart than this [m] suggest no other convention: in a robot's mission whose views
+lie meters apart, walls of two rooms fit in one pair of ten."""
+
 _MAX_FRAMES = 200
 """Number of frames after which the test is given up: a camera that hardly moves is never
 conclusive."""
@@ -102,8 +106,13 @@ def check_poses(reference: Reference | None, frame: Frame) -> Reference:
         # The frames do not overlap as given. That they do with another convention may be chance,
         # but not repeatedly; "ros" turns a sideways rotation into a roll, with which any two walls
         # fit.
-        if not fits or fitting == "ros":
-            return replace(now, suspect=reference.suspect, num_suspected=reference.num_suspected)
+        suspect = reference.suspect
+        if suspect and shares[suspect] > _MAX_OF_FITTING:
+            # Frames in their true convention never contradict, so the earlier fit was chance.
+            return replace(now, suspect="", num_suspected=0)
+        apart = np.linalg.norm(now.T_world_camera[:3, 3] - reference.T_world_camera[:3, 3])
+        if not fits or fitting == "ros" or apart > _MAX_APART:
+            return replace(now, suspect=suspect, num_suspected=reference.num_suspected)
         pairs = reference.num_suspected + 1 if fitting == reference.suspect else 1
         if pairs >= _SUSPECTED:
             _warn("frames overlap that should not", fitting, fits)

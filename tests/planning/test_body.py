@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
+from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.planning.robot.body import Body
 from r3jax.planning.robot.motion import make_motion, motion_of_record
@@ -139,6 +140,45 @@ def test_unknown_cells_below_the_camera_count_as_the_policy_says():
     assert np.isfinite(camera_less("free", seen).cost[18]).any()
     assert not np.isfinite(camera_less("never", near_and_far).cost[18]).any()
     assert not np.isfinite(camera_less("free", near_and_far).cost[18]).any()
+
+
+@given(width=st.floats(0.16, 0.3), end=st.floats(1.0, 3.0), radius=st.floats(0.1, 0.3))
+@settings(max_examples=30, deadline=None)
+def test_the_hidden_part_of_a_wall_is_not_driven_through(width, end, radius):
+    """Of a wall with one side in view the map has that side; its cells are occupied or unknown."""
+    face = 2.6
+    is_hidden = lambda p: (p[:, 0] > face) & (p[:, 0] < face + width) & (p[:, 1] < end)
+    seen = floor_voxels()
+    seen = seen[~is_hidden(seen)]
+    y = np.arange(0.025, end, VOXEL)
+    voxels = np.concatenate([seen, *[pole(face + 0.025, v) for v in y]])
+    centers = -CELL + CELL * (np.moveaxis(np.indices(SHAPE), 0, -1) + 0.5)
+    reach = 0.5 * CELL
+    is_near = (centers[..., 0] > face - reach) & (centers[..., 0] < face + width + reach)
+    free = all_free() & ~(is_near & (centers[..., 1] < end + reach))
+    room = room_of(Body(radius), voxels, free)
+    x, y = np.meshgrid(*[np.arange(0.0125, SIZE, 0.025)] * 2, indexing="ij")
+    places = np.stack([x, y], axis=-1).reshape(-1, 2)
+    places = places[room.fits(places)]
+    low, high = np.array([face, -1.0]), np.array([face + width, end])
+    gap = np.linalg.norm(np.maximum(0.0, np.maximum(low - places, places - high)), axis=1)
+    assert gap.min() >= radius - VOXEL  # the map is no finer
+
+
+def test_unknown_floor_is_trusted_round_the_first_place_only():
+    free = all_free()
+    free[:, :, 1] = False  # nothing is known of the lowest layer, but for the floor's voxels
+    seen = floor_voxels()
+    away = np.hypot(seen[:, 0] - 1.5, seen[:, 1] - 2.0)
+    ring = seen[(away > 0.8) & (np.abs(seen[:, 0] - 3.0) > 0.3)]
+    camera = Camera(64, 48, 60.0, 40.0, 32.0, 24.0)  # sees the floor from 0.83 m on
+    grid = grid_of(free)
+    room = room_for(Body(0.2), grid, ring, VOXEL, pose_at(1.5, 2.0), camera)
+    assert np.isfinite(room.cost[12]).any()  # off the place where it started
+    assert not np.isfinite(room.cost[17:]).any()  # not over a strip of which nothing was seen
+    first = np.array([[0.5, 0.5]])
+    room = room_for(Body(0.2), grid, ring, VOXEL, pose_at(1.5, 2.0), camera, None, first)
+    assert not np.isfinite(room.cost[12]).any()
 
 
 def test_a_thin_thing_that_the_map_does_not_hold_is_an_obstacle():

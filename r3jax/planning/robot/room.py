@@ -8,15 +8,19 @@ above, like Nav2's obstacle layer, and computes the distance of each point to al
   outwards from the robot, so that ramps and a noisy floor are not obstacles;
 - occupied cells of the grid in which the map has no voxel (thin things, whose pixels lie on edges);
 - keep-out zones and the obstacles of a costmap (`OccupancyGrid.closed`);
-- columns of cells that are not known. Free and occupied cells both count as known: obstacles in
-  them are given by the voxels. Cells where the robot has been are known. Cells below the camera
-  that it cannot see are treated according to `unknown_below`.
+- what is not known. A column of cells is known if all that the body takes up of it is free, a
+  pixel of it also if the floor was seen there: the voxels say what stands beside it. A voxel says
+  nothing of the rest of its cell: behind the seen side of a wall is its other side. Where the robot
+  has stood is known, too.
+
+Cells below the camera that it cannot see count as `unknown_below` says.
 
 On the host: NumPy and SciPy. Shape symbols: X Y Z cells; x y pixels of the plan; n points.
 """
 
 import functools
 import itertools
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -39,6 +43,9 @@ _FLOOR_SHARE = 0.25
 _MAX_BLIND = 2.0
 """Unseen floor counts as free only up to this distance from the robot's path [m], even for cameras
 that see little of the floor."""
+
+_AHEAD = 0.5
+"""How far before the robot everything must be known that its camera can see [m]."""
 
 _LEAVING = 0.3
 """Within this distance of the robot the margin is not required [m], as it is there already."""
@@ -97,10 +104,11 @@ class Room:
 
     def fits(self, points: np.ndarray) -> np.ndarray:
         """Checks if the body fits at points [..., 2 or 3] [m]."""
-        index = np.floor((points[..., :2] - self.origin) / self.pixel).astype(np.int64)
-        is_inside = np.all((index >= 0) & (index < self.distance.shape), axis=-1)
-        x, y = np.moveaxis(np.where(is_inside[..., None], index, 0), -1, 0)
-        return is_inside & (self.distance[x, y] >= self.needed)
+        index = (np.asarray(points)[..., :2] - self.origin) / self.pixel - 0.5
+        # Between the centers of pixels: a distance read at the nearest one is half a pixel off.
+        at = np.moveaxis(index, -1, 0)
+        distance = ndimage.map_coordinates(self.distance, at, order=1, cval=0.0)
+        return np.asarray(distance >= self.needed - 1e-9)
 
     def fits_along(self, start: np.ndarray, ends: np.ndarray) -> np.ndarray:
         """Checks if the body fits everywhere on the straight lines to ends [n, 3] [m], [n] bool."""
@@ -121,6 +129,7 @@ def room_for(
     T_world_camera: np.ndarray,
     camera: Camera | None = None,
     trail: np.ndarray | None = None,
+    stood: np.ndarray | None = None,
 ) -> Room:
     """Makes the plan for a body with a footprint.
 
@@ -129,40 +138,49 @@ def room_for(
         grid: the grid.
         voxels: centers of the map's voxels, [n, 3] [m].
         voxel_size: edge of a voxel [m].
-        T_world_camera: pose of the camera, [4, 4].
-        camera: its intrinsics, which give the nearest visible floor; None: it does not see the
-            floor.
-        trail: cells that the robot has passed, [X, Y, Z] bool.
+        T_world_camera: where the camera is, [4, 4].
+        camera: its lens, which tells how near it sees the floor; None: it does not.
+        trail: cells that the robot has come through, [X, Y, Z] bool.
+        stood: where its views were taken, the first one first, [V, 2] [m]; None: here only.
     """
     known = _Known.of(body, grid, voxels, voxel_size, T_world_camera, trail)
-    blind = _blind_radius(camera, T_world_camera, known.height)
     thin = known.thin_obstacles()
-    passable = known.columns(blind, thin) & ~thin
     num, shape = PIXELS_PER_CELL, known.free.shape
     pixel = known.size / num
-    closed = np.repeat(np.repeat(~passable, num, axis=0), num, axis=1)
+    by_pixel = lambda columns: np.repeat(np.repeat(columns, num, axis=0), num, axis=1)
+    seen = by_pixel(known.seen_columns(_highest_seen(camera, T_world_camera, known.height, body)))
+    floor = known.seen_floor(num)
+    passable = by_pixel(known.columns()) | (floor & seen)
+    if body.unknown_below == "free":
+        blind = _blind_radius(camera, T_world_camera, known.height)
+        first = known.position[:2] if stood is None or not len(stood) else stood[0]
+        passable |= known.blind_spot(passable | floor, first, blind, num) & by_pixel(~thin)
     low, position = known.origin, known.position
-    x, y = (low[i] + pixel * (np.arange(closed.shape[i]) + 0.5) - position[i] for i in range(2))
-    own = np.hypot(x[:, None], y[None, :])
-    # The robot's own position counts as known.
-    closed &= own > body.needed + pixel
+    x, y = (low[i] + pixel * (np.arange(passable.shape[i]) + 0.5) for i in range(2))
+    own = np.hypot(x[:, None] - position[0], y[None, :] - position[1])
+    # Where the robot stands and has stood is known, whatever the cells say.
+    is_own = own <= body.needed + pixel
+    for place in () if stood is None else stood:
+        # A window round the place: a mission has hundreds of them.
+        begin = np.floor((place - body.needed - low[:2]) / pixel).astype(int).clip(0)
+        i, j = (slice(k, k + int(2 * body.needed / pixel) + 2) for k in begin)
+        gap = np.hypot(x[i, None] - place[0], y[None, j] - place[1])
+        passable[i, j] |= gap <= body.needed
+    closed = ~(passable & by_pixel(~thin) | is_own)
     if grid.closed is not None:
-        zones = grid.closed.any(axis=2)
-        closed |= np.repeat(np.repeat(zones, num, axis=0), num, axis=1)
-    hit = np.floor((known.obstacles[:, :2] - low[:2]) / pixel).astype(np.int64)
-    obstacles = np.zeros_like(closed)
-    obstacles[tuple(np.clip(hit, 0, np.array(closed.shape) - 1).T)] = True
-    # The robot is not inside of an obstacle: voxels there are itself, or noise.
-    obstacles &= own > body.radius
-    # Beyond the grid nothing is known.
-    blocked = np.pad(closed | obstacles, 1, constant_values=True)
-    distance = np.asarray(ndimage.distance_transform_edt(~blocked))[1:-1, 1:-1] * pixel
+        closed |= by_pixel(grid.closed.any(axis=2))
+    # The robot is not inside of anything: what seems to be there is itself, or noise.
+    places = known.obstacles[:, :2]
+    places = places[np.linalg.norm(places - position[:2], axis=1) > body.radius]
+    distance = _distances(closed, places, low[:2], pixel, 0.5 * voxel_size)
     stop, cost, previous = _search(distance, own, pixel, num, body)
     near = own.reshape(shape[0], num, shape[1], num).min(axis=(1, 3)) <= body.needed + 0.5
-    hit_columns = obstacles.reshape(shape[0], num, shape[1], num).any(axis=(1, 3)) | thin
+    by_column = lambda pixels: pixels.reshape(shape[0], num, shape[1], num).any(axis=(1, 3))
+    hit_columns = thin.copy()
+    hit_columns[tuple(np.floor((places - low[:2]) / known.size).astype(np.int64).T)] = True
     counts = {
         "near": int(near.sum()),
-        "unknown": int((near & ~passable & ~thin).sum()),
+        "unknown": int((near & ~by_column(passable) & ~thin).sum()),
         "obstacle": int((near & hit_columns).sum()),
         "open": int((near & np.isfinite(cost)).sum()),
     }
@@ -240,7 +258,7 @@ class _Known:
         return cls(body, free, occupied, origin, size, voxels, above, cells, voxel_size, position,
                    height, floor, within, low, top, been)  # fmt: skip
 
-    @property
+    @functools.cached_property
     def obstacles(self) -> np.ndarray:
         """Centers of voxels that the body would touch, [n, 3] [m]."""
         top = self.top[self.cells[:, 0], self.cells[:, 1]]
@@ -248,12 +266,11 @@ class _Known:
         is_above = self.above > self.low + 0.1 * self.voxel_size
         return self.voxels[is_above & (self.voxels[:, 2] - 0.5 * self.voxel_size < top)]
 
-    @functools.cached_property
-    def has_voxel(self) -> np.ndarray:
-        """Cells into which a voxel reaches, [X, Y, Z] bool."""
+    def cells_with(self, voxels: np.ndarray) -> np.ndarray:
+        """Finds cells into which voxels [n, 3] [m] reach, [X, Y, Z] bool."""
         found, last = np.zeros(self.free.shape, bool), np.array(self.free.shape) - 1
         low, high = (
-            np.clip(np.floor((self.voxels + half - self.origin) / self.size), 0, last).astype(int)
+            np.clip(np.floor((voxels + half - self.origin) / self.size), 0, last).astype(int)
             for half in (-0.5 * self.voxel_size, 0.5 * self.voxel_size)
         )
         for x, y, z in itertools.product((low, high), repeat=3):
@@ -261,38 +278,153 @@ class _Known:
         return found
 
     def thin_obstacles(self) -> np.ndarray:
-        """Finds columns with an occupied cell above the floor but without a voxel in it, [X, Y]."""
+        """Finds columns with an occupied cell above the floor that no obstacle explains, [X, Y].
+
+        The seat of a chair does not explain what was measured below it: that is a leg.
+        """
         lower = self.origin[2] + self.size * np.arange(self.free.shape[2])
         floor, step = self.floor[..., None], self.body.step
         holds_floor = (lower < floor + step) & (lower + self.size > floor - step)
-        return (self.within & self.occupied & ~self.has_voxel & ~holds_floor).any(axis=2)
+        unexplained = self.occupied & ~self.cells_with(self.obstacles)
+        return np.any(self.within & unexplained & ~holds_floor, axis=2)
 
-    def columns(self, blind: float, thin: np.ndarray) -> np.ndarray:
-        """Finds columns in which enough cells are known for the body, [X, Y] bool."""
-        known = (self.free | self.occupied | self.has_voxel | ~self.within).all(axis=2)
-        radius = self.body.needed / self.size
-        known |= _dilated(self.been, radius)
-        if self.body.unknown_below == "never":
-            return known
-        at_floor = self.cells[np.abs(self.above) <= 1.3 * self.voxel_size]
-        known[at_floor[:, 0], at_floor[:, 1]] = True
-        lowest = np.argmax(self.within, axis=2)[..., None]
-        known |= np.take_along_axis(self.free, lowest, axis=2)[..., 0]
+    def columns(self) -> np.ndarray:
+        """Finds columns that are free as far as the body takes them up, [X, Y] bool.
+
+        Those that the robot has come through are free, too.
+        """
+        return (self.free | ~self.within).all(axis=2) | self.been
+
+    def seen_columns(self, blind: float) -> np.ndarray:
+        """Finds columns in which nothing that the camera could see is unknown, [X, Y] bool.
+
+        A cell is known by the voxels in it, too. `unknown_below` says if the lowest one may be
+        unknown, and those that the image shows from nearby only.
+
+        Args:
+            blind: heights above this are out of the image's upper edge until the robot is there
+                [m], above the floor.
+        """
+        voxels = self.voxels[self.above > self.low - self.size]  # the others lie below the body
+        known = self.free | self.occupied | self.cells_with(voxels) | ~self.within
+        if self.body.unknown_below == "free":
+            middle = self.origin[2] + self.size * (np.arange(known.shape[2]) + 0.5)
+            # A cell is free once its lower half was seen through.
+            known |= middle - 0.25 * self.size - self.floor[..., None] > blind
+            lowest = np.argmax(self.within, axis=2)[..., None]
+            np.put_along_axis(known, lowest, True, axis=2)
+        return np.all(known, axis=2)
+
+    def seen_floor(self, num: int) -> np.ndarray:
+        """Finds pixels at which the floor was seen, [num X, num Y] bool."""
+        shape = num * self.free.shape[0], num * self.free.shape[1]
+        is_floor = np.abs(self.above) <= 1.3 * self.voxel_size
+        pixels = np.floor((self.voxels[:, :2] - self.origin[:2]) * num / self.size)
+        pixels = np.clip(pixels.astype(np.int64), 0, np.array(shape) - 1)
+        seen = np.zeros(shape, bool)
+        tall = np.asarray(self.above > self.low + 0.1 * self.voxel_size)
+        seen[tuple(pixels[is_floor].T)] = True
+        is_wall = tuple(pixels[tall].T)
+        seen[is_wall] = False  # the lowest voxel of a wall is no floor
+        # Gaps between voxels are filled, and between the rows of an image where nothing stands:
+        # what hides in them would have to be narrower than they are.
+        least = max(1.0, self.voxel_size * num / self.size)
+        beside = np.zeros(self.free.shape[:2], bool)
+        beside[tuple(self.cells[tall, :2].T)] = True
+        beside = np.asarray(ndimage.binary_dilation(beside, np.ones((3, 3), bool)), bool)
+        is_clear = np.repeat(np.repeat(~beside, num, axis=0), num, axis=1)
+        return _closed(seen, least) | (_closed(seen, least + 1.0) & is_clear)
+
+    def blind_spot(
+        self, known: np.ndarray, first: np.ndarray, blind: float, num: int
+    ) -> np.ndarray:
+        """Finds what the camera could not see of the floor round the robot's first place.
+
+        It looked over it, and sees the floor behind; later places it has looked at from afar.
+
+        Args:
+            known: pixels that are known, [num X, num Y] bool.
+            first: where the first view was taken, [2] [m].
+            blind: how far from the robot the image first shows the floor [m].
+            num: pixels along a cell.
+
+        Returns:
+            [num X, num Y] bool.
+        """
         if blind <= 0.0:
-            return known
-        hit = np.zeros(known.shape, bool)
+            return np.zeros(known.shape, bool)
+        shape = self.free.shape[:2]
+        hit = np.zeros(shape, bool)
         tall = self.cells[self.above > self.body.step + self.voxel_size]
         hit[tall[:, 0], tall[:, 1]] = True
-        # Around obstacles, not through them: the space behind a table is not the camera's blind
-        # spot.
-        near, square = _dilated(self.been, radius), np.ones((3, 3), bool)
+        x, y = (self.origin[i] + self.size * (np.arange(shape[i]) + 0.5) - first[i] for i in (0, 1))
+        near = np.hypot(x[:, None], y[None, :]) <= self.body.needed
+        # Round obstacles, not through them: what hides behind a table is not the blind spot.
         for i in range(int(np.ceil(blind / self.size / 0.85))):
-            near = np.asarray(ndimage.binary_dilation(near, None if i % 2 else square, mask=~hit))
-        gap = 0.5 * blind / self.size + 1.0
-        pad = int(np.ceil(gap)) + 1
-        closed = np.asarray(ndimage.binary_closing(np.pad(known, pad), _disk(gap)))
-        around = closed[pad:-pad, pad:-pad]
-        return known | (np.asarray(near, bool) & np.asarray(around, bool) & ~thin)
+            square = None if i % 2 else np.ones((3, 3), bool)
+            near = np.asarray(ndimage.binary_dilation(near, square, mask=~hit), bool)
+        near = near & np.any(self.free & self.within, axis=2)
+        gap = num * (0.5 * blind / self.size + 1.0)
+        found = np.repeat(np.repeat(near, num, axis=0), num, axis=1)
+        rows, columns = (np.flatnonzero(near.any(axis=axis)) for axis in (1, 0))
+        if not len(rows):
+            return found
+        reach = int(np.ceil(2.0 * gap)) + 1
+        window = tuple(
+            slice(max(num * int(k[0]) - reach, 0), num * (int(k[-1]) + 1) + reach)
+            for k in (rows, columns)
+        )
+        found[window] &= _closed(known[window], gap)
+        return found
+
+
+def _edt(mask: np.ndarray) -> np.ndarray:
+    return np.asarray(ndimage.distance_transform_edt(mask))
+
+
+def _closed(mask: np.ndarray, radius: float) -> np.ndarray:
+    """Fills gaps of a mask that are narrower than a disk of this radius [pixels]."""
+    pad = int(np.ceil(radius)) + 1
+    wide = np.pad(mask, pad)
+    if radius > 3.0:  # a large disk has many pixels: by distances instead
+        wide = _edt(~wide) <= radius
+        return (_edt(wide) > radius)[pad:-pad, pad:-pad]
+    side = np.arange(-int(radius), int(radius) + 1)
+    disk = np.hypot(side[:, None], side[None, :]) <= radius
+    return np.asarray(ndimage.binary_closing(wide, disk))[pad:-pad, pad:-pad]
+
+
+def _distances(
+    closed: np.ndarray, obstacles: np.ndarray, low: np.ndarray, pixel: float, half: float
+) -> np.ndarray:
+    """Measures from each pixel's center to the nearest closed pixel or obstacle [m].
+
+    Args:
+        closed: pixels that the body must not touch, [x, y] bool.
+        obstacles: middles of voxels, [n, 2] [m]; to their sides is measured, not to the middles of
+            the pixels that hold them.
+        low: lower corner of the plan [m], [2].
+        pixel: side of a pixel [m].
+        half: half the side of a voxel [m].
+    """
+    targets = np.moveaxis(np.indices(closed.shape) + 0.5, 0, -1) * pixel
+    scaled = (obstacles - low) / pixel
+    index = tuple(np.clip(np.floor(scaled).astype(np.int64), 0, np.array(closed.shape) - 1).T)
+    blocked, centers = closed.copy(), targets.copy()
+    blocked[index] = True
+    targets[index] = np.where(closed[index][:, None], targets[index], scaled * pixel)
+    sides = np.zeros(closed.shape)
+    sides[index] = np.where(closed[index], 0.0, half)
+    # Beyond the grid nothing is known.
+    far = np.pad(~blocked, 1)
+    nearest = np.asarray(
+        ndimage.distance_transform_edt(far, return_distances=False, return_indices=True)
+    )[:, 1:-1, 1:-1]
+    targets = np.pad(targets, ((1, 1), (1, 1), (0, 0)), mode="reflect", reflect_type="odd")
+    at = nearest[0], nearest[1]
+    side = np.pad(sides, 1)[at]
+    gap = np.maximum(np.abs(targets[at] - centers) - side[..., None], 0.0)
+    return np.where(blocked, 0.0, np.linalg.norm(gap, axis=-1))
 
 
 def _search(
@@ -360,9 +492,9 @@ def _floor_map(
     low = np.floor(origin[2] / voxel_size)
     num = int(np.ceil(shape[2] * size / voxel_size)) + 2
     level = np.clip(np.floor(voxels[:, 2] / voxel_size) - low, 0, num - 1).astype(np.int64)
-    # Their number counts: a single outlier must not raise the floor.
-    filled = np.zeros((*shape[:2], num))
-    np.add.at(filled, (cells[:, 0], cells[:, 1], level), 1.0)
+    # How many, not whether any: a stray voxel of noise must not lift the floor.
+    at = np.ravel_multi_index((cells[:, 0], cells[:, 1], level), (*shape[:2], num))
+    filled = np.bincount(at, minlength=shape[0] * shape[1] * num).reshape(*shape[:2], num)
     heights = (low + np.arange(num) + 0.5) * voxel_size
     floor = np.full(shape[:2], np.nan)
     x, y = np.clip(_column(position, origin, size), 0, np.array(shape[:2]) - 1)
@@ -388,14 +520,16 @@ def _floor_map(
     return np.where(np.isnan(floor), start, floor)
 
 
-def _disk(radius: float) -> np.ndarray:
-    reach = int(np.floor(radius))
-    x = np.arange(-reach, reach + 1)
-    return np.hypot(x[:, None], x[None, :]) <= radius
-
-
-def _dilated(mask: np.ndarray, radius: float) -> np.ndarray:
-    return np.asarray(ndimage.binary_dilation(mask, _disk(radius)))
+def _highest_seen(
+    camera: Camera | None, T_world_camera: np.ndarray, height: float, body: Body
+) -> float:
+    """Computes how high above the floor the image shows what the robot is about to reach [m]."""
+    if camera is None:
+        return math.inf
+    T = np.asarray(T_world_camera, np.float64)
+    ray = T[:3, :3] @ np.array([0.0, -float(camera.cy) / float(camera.fy), 1.0])
+    slope = ray[2] / max(float(np.hypot(ray[0], ray[1])), 1e-9)
+    return math.inf if slope >= 0.0 else height + slope * (body.needed + _AHEAD)
 
 
 def _blind_radius(camera: Camera | None, T_world_camera: np.ndarray, height: float) -> float:

@@ -21,6 +21,7 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import ndimage
 
 from r3jax.errors import InputError
 from r3jax.kernels.robot.shortest_paths import shortest_paths
@@ -31,6 +32,9 @@ from r3jax.planning.robot.room import Room
 _INSET = 1e-2
 """A camera at a fixed height on the border of layers is moved by this distance into its own layer
 [cells], so that the next layer does not count."""
+
+NEW_PLACE = 1.0
+"""A place this far from all others [m] is a new one."""
 
 _TOUCH = 1e-3
 """Tolerance [cells]: a height this close to a border of layers belongs to the upper layer, and a
@@ -78,6 +82,18 @@ class Travel:
 
     room: Room | None = None
     """The plan in which a footprint moves; None: a sphere, for which `usable` is all there is."""
+
+    fresh: np.ndarray | None = None
+    """Columns of cells that are `NEW_PLACE` from wherever a footprint has been, round obstacles,
+    [X, Y] bool; None: it does not matter."""
+
+    def is_fresh(self, positions: np.ndarray) -> np.ndarray:
+        """Checks if positions [n, 3] [m] lie in columns where the robot has not been, [n] bool."""
+        if self.fresh is None:
+            return np.ones(len(positions), bool)
+        cells = np.floor((positions[:, :2] - self.origin[:2]) / self.cell_size).astype(np.int64)
+        x, y = np.clip(cells, 0, np.array(self.fresh.shape) - 1).T
+        return self.fresh[x, y]
 
     @functools.cached_property
     def reachable(self) -> np.ndarray:
@@ -172,10 +188,10 @@ class Travel:
         if not (self.contains(cell) and self.reachable[cell]):
             raise InputError(f"no safe path leads from {self.start} to {goal} (cell {cell})")
         if self.room is not None:
-            middle = self.room.path(cell[:2])[1:]
+            # It turns on the spot, or drives straight where its own cell has no room to spare.
+            is_here = np.linalg.norm(goal - self.start) < 1e-6 or self.room.stop[cell[:2]] < 0
+            middle = np.zeros((0, 2)) if is_here else self.room.path(cell[:2])[1:]
             middle = np.column_stack([middle, np.full(len(middle), goal[2])])
-            if np.linalg.norm(goal - self.start) < 1e-6:
-                middle = middle[:0]  # it turns in place
             return self._shortcut(np.concatenate([self.start[None], middle, goal[None]]))
         # From the goal back to the robot: each cell stores the one before it.
         way = [int(np.ravel_multi_index(cell, self.usable.shape))]
@@ -317,6 +333,27 @@ def plan_travel(
         heights=heights,
         refused=grid.refused,
     )
+
+
+def fresh_columns(travel: Travel, trail: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Finds columns farther than `NEW_PLACE` from those where the robot has been, round obstacles.
+
+    Args:
+        travel: where it can go.
+        trail: cells that it has come through, [X, Y, Z] bool.
+        places: where it has stood, [V, 2] [m].
+
+    Returns:
+        [X, Y] bool.
+    """
+    is_open, near = np.any(travel.reachable, axis=2), np.any(trail, axis=2)
+    cells = np.floor((places - travel.origin[:2]) / travel.cell_size).astype(np.int64)
+    near[tuple(np.clip(cells, 0, np.array(near.shape) - 1).T)] = True
+    near &= is_open
+    for i in range(round(NEW_PLACE / travel.cell_size / 0.85)):  # crosses and squares in turn
+        square = np.ones((3, 3), bool) if i % 2 else None
+        near = np.asarray(ndimage.binary_dilation(near, square, mask=is_open), bool)
+    return is_open & ~near
 
 
 def safe_cells(free: np.ndarray, cell_size: float, margin: float) -> np.ndarray:
