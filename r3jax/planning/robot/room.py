@@ -282,18 +282,40 @@ class _Known:
 
         The seat of a chair does not explain what was measured below it: that is a leg.
         """
+        unexplained = self.occupied & ~self.cells_with(self.obstacles)
+        return np.any(self.within & unexplained & ~self.holds_floor, axis=2)
+
+    @functools.cached_property
+    def holds_floor(self) -> np.ndarray:
+        """Cells in which the floor may be measured, [X, Y, Z] bool."""
         lower = self.origin[2] + self.size * np.arange(self.free.shape[2])
         floor, step = self.floor[..., None], self.body.step
-        holds_floor = (lower < floor + step) & (lower + self.size > floor - step)
-        unexplained = self.occupied & ~self.cells_with(self.obstacles)
-        return np.any(self.within & unexplained & ~holds_floor, axis=2)
+        return (lower < floor + step) & (lower + self.size > floor - step)
+
+    @functools.cached_property
+    def is_floor(self) -> np.ndarray:
+        """Which of the voxels are of the floor, [n] bool."""
+        return np.abs(self.above) <= 1.3 * self.voxel_size
+
+    @functools.cached_property
+    def beside(self) -> np.ndarray:
+        """Columns with an obstacle in them or in a column next to them, [X, Y] bool."""
+        hit = np.floor((self.obstacles[:, :2] - self.origin[:2]) / self.size).astype(np.int64)
+        beside = np.zeros(self.free.shape[:2], bool)
+        beside[tuple(hit.T)] = True
+        return np.asarray(ndimage.binary_dilation(beside, np.ones((3, 3), bool)), bool)
 
     def columns(self) -> np.ndarray:
         """Finds columns that are free as far as the body takes them up, [X, Y] bool.
 
-        Those that the robot has come through are free, too.
+        Those that the robot has come through are free, too; and those where the floor was seen,
+        with nothing on it or beside them, and all above the floor's own cell is free.
         """
-        return (self.free | ~self.within).all(axis=2) | self.been
+        has_floor = np.zeros(self.free.shape[:2], bool)
+        has_floor[tuple(self.cells[self.is_floor, :2].T)] = True
+        free = self.free | ~self.within
+        above_floor = np.all(free | self.holds_floor, axis=2)
+        return np.all(free, axis=2) | self.been | (above_floor & has_floor & ~self.beside)
 
     def seen_columns(self, blind: float) -> np.ndarray:
         """Finds columns in which nothing that the camera could see is unknown, [X, Y] bool.
@@ -318,21 +340,17 @@ class _Known:
     def seen_floor(self, num: int) -> np.ndarray:
         """Finds pixels at which the floor was seen, [num X, num Y] bool."""
         shape = num * self.free.shape[0], num * self.free.shape[1]
-        is_floor = np.abs(self.above) <= 1.3 * self.voxel_size
-        pixels = np.floor((self.voxels[:, :2] - self.origin[:2]) * num / self.size)
-        pixels = np.clip(pixels.astype(np.int64), 0, np.array(shape) - 1)
+        pixels = lambda voxels: tuple(
+            np.clip((voxels[:, i] - self.origin[i]) * num / self.size, 0, shape[i] - 1).astype(int)
+            for i in (0, 1)
+        )
         seen = np.zeros(shape, bool)
-        tall = np.asarray(self.above > self.low + 0.1 * self.voxel_size)
-        seen[tuple(pixels[is_floor].T)] = True
-        is_wall = tuple(pixels[tall].T)
-        seen[is_wall] = False  # the lowest voxel of a wall is no floor
+        seen[pixels(self.voxels[self.is_floor])] = True
+        seen[pixels(self.obstacles)] = False  # the lowest voxel of a wall is no floor
         # Gaps between voxels are filled, and between the rows of an image where nothing stands:
         # what hides in them would have to be narrower than they are.
         least = max(1.0, self.voxel_size * num / self.size)
-        beside = np.zeros(self.free.shape[:2], bool)
-        beside[tuple(self.cells[tall, :2].T)] = True
-        beside = np.asarray(ndimage.binary_dilation(beside, np.ones((3, 3), bool)), bool)
-        is_clear = np.repeat(np.repeat(~beside, num, axis=0), num, axis=1)
+        is_clear = np.repeat(np.repeat(~self.beside, num, axis=0), num, axis=1)
         return _closed(seen, least) | (_closed(seen, least + 1.0) & is_clear)
 
     def blind_spot(
