@@ -360,17 +360,22 @@ def run(options: Options, path: Path) -> None:
                   flush=True)  # fmt: skip
 
 
-def table(records: Sequence[Record], share: float) -> list[dict[str, Any]]:
-    """One row per chooser at a share, the best first: means over the captures, with intervals.
+def compared(
+    records: Sequence[Record], share: float, choosers: Sequence[str]
+) -> tuple[list[Record], list[str]]:
+    """Records of some choosers at a share, and the captures on which all of them are done.
 
-    Of captures where all choosers are done: means over others could not be compared.
+    Means over different captures could not be compared.
     """
-    at = [r for r in records if r["share"] in (share, 1.0)]
-    choosers = {r["chooser"] for r in at}
-    captures = {
-        r["capture"]: {o["chooser"] for o in at if o["capture"] == r["capture"]} for r in at
-    }
-    at = [r for r in at if captures[r["capture"]] == choosers]
+    at = [r for r in records if r["share"] in (share, 1.0) and r["chooser"] in choosers]
+    captures = list(dict.fromkeys(r["capture"] for r in at))
+    done = lambda capture: {r["chooser"] for r in at if r["capture"] == capture}
+    captures = [capture for capture in captures if done(capture) == set(choosers)]
+    return [r for r in at if r["capture"] in captures], captures
+
+
+def table(at: Sequence[Record]) -> list[dict[str, Any]]:
+    """One row per chooser, the best first: means over the captures, with intervals."""
     rows: list[tuple[float, dict[str, Any]]] = []
     for chooser in dict.fromkeys(r["chooser"] for r in at):
         own = [r for r in at if r["chooser"] == chooser]
@@ -387,7 +392,6 @@ def table(records: Sequence[Record], share: float) -> list[dict[str, Any]]:
             if all(r["lpips"] for r in own) else "–",
             "choosing [CPU s]": f"{np.median([r['choosing']['cpu'] for r in own]):.0f}",
             "training [CPU s]": f"{np.median([r['training']['cpu'] for r in own]):.0f}",
-            "captures": len({r["capture"] for r in own}),
             "trainings": len(own),
         }  # fmt: skip
         rows.append((psnr.value, row))
@@ -448,7 +452,7 @@ def by_capture(
     return rows
 
 
-def write_page(records: Sequence[Record], folder: Path) -> None:
+def write_page(records: Sequence[Record], choosers: Sequence[str], folder: Path) -> None:
     """Writes the tables, one of each share and number of iterations."""
     lines: list[str] = []
     for terms in dict.fromkeys((r["iterations"], r["resolution"]) for r in records):
@@ -457,7 +461,10 @@ def write_page(records: Sequence[Record], folder: Path) -> None:
             lines.append(
                 f"## {100 * share:g} % of the frames, {terms[0]} iterations at {terms[1]} px"
             )
-            lines += [markdown_table(table(some, share)), markdown_table(by_capture(some, share))]
+            at, captures = compared(some, share, choosers)
+            if captures:
+                lines += [f"Means over {', '.join(captures)}:", markdown_table(table(at))]
+            lines += ["PSNR by capture, of all choosers:", markdown_table(by_capture(some, share))]
             lines.append("PSNR after the gain of each channel that fits best:")
             lines.append(markdown_table(by_capture(some, share, "exposed")))
     commits = [r["commit"] for r in records]
@@ -473,7 +480,7 @@ def main(options: Options) -> None:
     path = options.out / "records.jsonl"
     if not options.only_table:
         run(options, path)
-    write_page(list(read_records(path).values()), options.out)
+    write_page(list(read_records(path).values()), options.choosers, options.out)
 
 
 if __name__ == "__main__":

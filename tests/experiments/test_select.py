@@ -11,6 +11,7 @@ from experiments.select import (
     Cell,
     Options,
     by_capture,
+    compared,
     exposed_psnr,
     main,
     open_pool,
@@ -71,7 +72,10 @@ def test_leads_pair_the_same_captures_and_seeds():
         record("b", "select", 0, [30.0, 30.0]), record("b", "select", 1, [90.0, 90.0]),
         record("b", "uniform", 0, [31.0, 30.0]),
     ]  # fmt: skip
-    rows = {row["chooser"]: row for row in table(records, 0.1)}
+    at, captures = compared(records, 0.1, ["select", "uniform"])
+    assert captures == ["a", "b"]
+    assert compared(records, 0.1, ["select", "uniform", "random"])[1] == []
+    rows = {row["chooser"]: row for row in table(at)}
     assert rows["uniform"]["select minus it"].startswith("+0.50 ")
     assert rows["select"]["trainings"] == 3
     assert by_capture(records, 0.1)[0] == {"chooser": "select", "a": "22.00", "b": "60.00"}
