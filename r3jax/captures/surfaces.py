@@ -255,13 +255,25 @@ def _failed(source: Source, found: Source) -> str | None:
         _, depth = found.read(index)
         kept.append(float((depth > 0.0).mean()))
         off.append(_off(depth, found, index, points_shown(source, index)))
-    if np.mean(kept) < _LEAST_KEPT:
-        return f"the photos agree on {100 * np.mean(kept):.1f} % of their pixels only"
+    share = np.mean(kept) / _unmasked(found)
+    if share < _LEAST_KEPT:
+        return f"the photos agree on {100 * share:.1f} % of their pixels only"
     ratio = np.concatenate(off)
     median = float(np.median(np.abs(ratio))) if len(ratio) else 0.0
     if median > _CONTRADICTED:
         return f"it is {100 * median:.0f} % off the points, so lens or poses are likely wrong"
     return None
+
+
+def _unmasked(source: Source) -> float:
+    """Computes the share of the pixels that no mask hides, of some photos; at least a thousandth.
+
+    Where masks cut out an object, nothing else can have a depth.
+    """
+    assert source.photograph is not None
+    some = evenly_spaced(len(source), _COMPARED).tolist()
+    shown = [(source.photograph(index, source.stride)[1] > 0.0).mean() for index in some]
+    return max(float(np.mean(shown)), 1e-3)
 
 
 def _off(depth: np.ndarray, found: Source, index: int, points: np.ndarray) -> np.ndarray:
