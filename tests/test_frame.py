@@ -98,5 +98,5 @@ def test_frames_pass_through_transformations():
 def test_structure_is_checked_under_jit_too():
     build = jax.jit(lambda rgb: Frame(**SOUND | {"rgb": rgb}).rgb)
     assert build(jnp.full((6, 8, 3), 2.0)).shape == (6, 8, 3)  # values are not known there
-    with pytest.raises(ValueError, match="rgb has shape"):
+    with pytest.raises(ValueError, match="rgb"):
         build(jnp.zeros((5, 8, 3)))

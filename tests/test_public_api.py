@@ -95,7 +95,7 @@ def test_malformed_queries_are_refused(m, frame):
         r3jax.voxel_renderability(m, jnp.zeros(4))
     with pytest.raises(ValueError, match="one number"):
         r3jax.voxel_renderability(m, frame.position, focal=jnp.ones(2))
-    with pytest.raises(ValueError, match="kappa must be"):
+    with pytest.raises(ValueError, match="kappa"):
         r3jax.voxel_renderability(m, frame.position, kappa="two")
 
 
@@ -175,8 +175,8 @@ def test_nothing_is_nan_inside(m, grid, camera, frame):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"kappa": "two"}, "kappa must be"),
-        ({"delta": "other"}, "delta must be"),
+        ({"kappa": "two"}, "kappa"),
+        ({"delta": "other"}, "delta"),
         ({"panorama_size": 100}, "power of two"),
     ],
 )

@@ -47,7 +47,7 @@ def test_its_settings_are_the_authors():
     config = make_policy("r3con").config
     assert (config.num_candidates, config.radius, config.num_frontier) == (50, 2.0, 0)
     assert config.cell_weight == 1000.0
-    with pytest.raises(ValueError, match="cell_weight must be"):
+    with pytest.raises(ValueError, match="cell_weight"):
         R3conConfig(cell_weight=-1.0)
 
 
@@ -111,7 +111,7 @@ def test_parts_can_be_exchanged_one_by_one(decided):
     """A path weight given replaces the adaptive one; the cone's sum replaces that of all round."""
     total = R3con(R3conConfig(path_weight=0.5)).weigh(candidates())
     np.testing.assert_allclose(total[1], 2100 / 3200 - 0.5 * 0.5)
-    with pytest.raises(ValueError, match="path_weight must be"):
+    with pytest.raises(ValueError, match="path_weight"):
         R3conConfig(path_weight=-1.0)
     state, grid = known()
     policy = make_policy("r3con", num_candidates=60, all_round=False, scoring=SCORING)

@@ -61,7 +61,7 @@ def test_axes_become_z_without_rounding():
         np.testing.assert_array_equal(R @ up_of(name), [0, 0, 1])
         assert set(np.abs(R).ravel()) == {0.0, 1.0}
     np.testing.assert_array_equal(rotation_to_z(up_of("y")) @ [1, 2, 3], [1, -3, 2])
-    with pytest.raises(ValueError, match="up must be one of"):
+    with pytest.raises(ValueError, match="up"):
         up_of("w")
 
 

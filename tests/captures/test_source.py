@@ -107,9 +107,7 @@ def test_nothing_is_invented_where_the_lens_saw_nothing():
 
 def test_a_lens_nobody_straightens_here_is_named():
     params = (40.0, 40.0, 32.0, 24.0, *[0.1] * (len(MODELS["RAD_TAN_THIN_PRISM_FISHEYE"][1]) - 4))
-    with pytest.raises(
-        ForeignFileError, match="RAD_TAN_THIN_PRISM_FISHEYE lens cannot be undistorted"
-    ):
+    with pytest.raises(ForeignFileError, match="RAD_TAN_THIN_PRISM_FISHEYE"):
         sampling_table(Lens("RAD_TAN_THIN_PRISM_FISHEYE", 64, 48, params), 2)
 
 

@@ -10,6 +10,7 @@ from r3jax.cli.commands.explore import run_settings
 from r3jax.cli.main import main
 from r3jax.cli.options.explore import ExploreOptions, MotionOptions
 from r3jax.cli.parsing import whole_number
+from r3jax.errors import InputError
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.runs.writer import RunWriter
 from tests.runs.runs import make_header
@@ -132,7 +133,7 @@ def test_whole_numbers_may_be_written_as_people_do(text, number):
 
 @pytest.mark.parametrize("text", ["512x512", "1.5", "", "nan", "inf", "1e999999999", "0x10"])
 def test_what_is_no_whole_number_is_said_so(text):
-    with pytest.raises(ValueError, match="expects one whole number"):
+    with pytest.raises(InputError):
         whole_number(text)
 
 

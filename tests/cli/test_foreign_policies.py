@@ -6,16 +6,10 @@ import pytest
 
 from r3jax.apps.benchmark.record import CELLS
 from r3jax.cli.main import main
-from tests.box_room import write_room
 from tests.cli.small_runs import explore, main_without_report
 from tests.planning.foreign.children import HIGHEST, command_of
 
 pytestmark = pytest.mark.full
-
-
-@pytest.fixture(scope="module")
-def room(tmp_path_factory):
-    return write_room(tmp_path_factory.mktemp("room") / "room.ply")
 
 
 def test_a_program_explores_goes_on_and_is_submitted(room, tmp_path):
@@ -54,7 +48,7 @@ def test_a_program_stands_in_a_table(room, tmp_path, capsys):
     ("code", "says"),
     [
         ("receive(); sys.exit('no weights')", "no weights"),
-        ("receive(); print('thinking', flush=True)", "print to the standard error"),
+        ("receive(); print('thinking', flush=True)", "standard error"),
     ],
 )
 def test_a_program_that_fails_gets_one_line_and_the_run_stays(room, tmp_path, capsys, code, says):

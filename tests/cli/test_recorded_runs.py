@@ -12,17 +12,11 @@ from r3jax.cli.main import main
 from r3jax.mapping.join import grow, merge
 from r3jax.runs.reader import read_run
 from r3jax.runs.replay import rebuild
-from tests.box_room import write_room
 from tests.cli.small_runs import explore, main_without_report
 
 pytestmark = pytest.mark.full
 
 VIEWS = 5
-
-
-@pytest.fixture(scope="module")
-def room(tmp_path_factory):
-    return write_room(tmp_path_factory.mktemp("mesh") / "room.ply")
 
 
 @pytest.fixture(scope="module")

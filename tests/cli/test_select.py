@@ -10,7 +10,6 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
-from r3jax.captures import capture_maps
 from r3jax.captures.camera_paths import write_camera_path
 from r3jax.cli.console import Stages
 from r3jax.cli.main import main
@@ -21,7 +20,6 @@ from tests.apps.audit.room import (
     LENS,
     pose_at,
     round_poses,
-    write_colmap,
     write_nerfstudio,
     write_recording,
 )
@@ -29,24 +27,7 @@ from tests.captures.faults.walk import CAMERA, walk
 from tests.conftest import shared_path
 from tests.formats.phones import video
 
-pytestmark = pytest.mark.full
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _small_maps():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(capture_maps, "_CAPACITY", 1 << 13)
-        yield
-
-
-@pytest.fixture(scope="module")
-def captures(tmp_path_factory):
-    """The same room as a recording, with depth for nerfstudio, and as a COLMAP model."""
-    folder = tmp_path_factory.mktemp("captures")
-    write_recording(folder / "recording", round_poses())
-    write_nerfstudio(folder / "nerfstudio", round_poses(), depth=True)
-    write_colmap(folder / "colmap", round_poses(), scale=3.0)
-    return folder
+pytestmark = [pytest.mark.full, pytest.mark.usefixtures("small_maps")]
 
 
 def select(capture, out, *words):

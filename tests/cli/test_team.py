@@ -11,7 +11,6 @@ from r3jax.files import lock_folder
 from r3jax.formats.nerfstudio import read_transforms
 from r3jax.runs.reader import read_run
 from r3jax.simulators.start import APART
-from tests.box_room import write_room
 
 VIEWS = 3
 
@@ -23,11 +22,6 @@ def team(room, out, *words):
     options |= {"out": out, "name": "pair", "meet-every": 0.5}
     given = [word for name, value in options.items() for word in (f"--{name}", str(value))]
     return main(["team", *given, "--fov", "90", "60", *words])
-
-
-@pytest.fixture(scope="module")
-def room(tmp_path_factory):
-    return write_room(tmp_path_factory.mktemp("mesh") / "room.ply")
 
 
 @pytest.fixture(scope="module")
@@ -92,9 +86,9 @@ def test_two_processes_do_not_write_one_team(room, pair, tmp_path, capsys):
     ("words", "message"),
     [
         (["--cameras", "3"], "--fov takes one value for all 3 cameras or one for each, got 2"),
-        (["--cameras", "0"], "--cameras must lie between 1 and 16"),
-        (["--meet-every", "-1"], "--meet-every must be a time >= 0"),
-        (["--policy", "nobody"], "unknown policy 'nobody'"),
+        (["--cameras", "0"], "--cameras"),
+        (["--meet-every", "-1"], "--meet-every"),
+        (["--policy", "nobody"], "'nobody'"),
         (["--start", "50", "0", "0"], "outside the world"),
     ],
 )
@@ -108,9 +102,9 @@ def test_what_cannot_fly_is_refused(room, tmp_path, capsys, words, message):
 @pytest.mark.parametrize(
     ("command", "message"),
     [
-        (["explore", "--resume", "{pair}/0"], "`r3jax team --resume"),
+        (["explore", "--resume", "{pair}/0"], "r3jax team --resume"),
         (["merge", "{pair}/0", "{pair}/1"], "its camera is not that of"),
-        (["team", "--resume", "{pair}", "--seed", "1"], "leave them out: --seed"),
+        (["team", "--resume", "{pair}", "--seed", "1"], "--seed"),
     ],
 )
 def test_what_a_member_of_a_team_cannot_do_is_said(pair, capsys, command, message):

@@ -128,9 +128,9 @@ def test_resume_of_other_settings_is_refused(recording, models, capsys):
     [
         ({"hold_out": 1}, "hold out nothing"),
         ({"resolution": 3}, "--resolution"),
-        ({"iterations": 0}, "iterations must be at least 1"),
-        ({"views_per_step": 10**9}, "more than 2^31 renderings"),
-        ({"capacity": 10}, "capacity 10 has no room"),
+        ({"iterations": 0}, "iterations"),
+        ({"views_per_step": 10**9}, "2^31"),
+        ({"capacity": 10}, "capacity 10"),
         ({"gaussians": 10**9}, "GB"),
     ],
 )

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from r3jax.errors import InputError
 from r3jax.evaluation.contact_sheet import ERROR_SCALE, SheetView, contact_sheet, error_picture
 from r3jax.plots import style
 from r3jax.plots.pictures import BEYOND
@@ -111,7 +112,7 @@ def test_it_is_a_png_whose_pictures_do_not_overlap():
 
 
 def test_no_views_is_a_mistake():
-    with pytest.raises(ValueError, match="at least one view"):
+    with pytest.raises(InputError):
         contact_sheet([], "title")
 
 

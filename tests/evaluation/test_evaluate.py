@@ -159,7 +159,7 @@ def test_too_small_a_budget_is_raised_or_named(own):
     assert int(drawn.num_intersections) > RasterConfig().budget(large.capacity)
     assert np.isfinite(evaluate(large, views, RasterConfig(backend="numba")).rows[0].psnr)
     fixed = RasterConfig(backend="numba", max_intersections=2048)
-    with pytest.raises(ValueError, match=r"view 0 needs \d+ intersections.*2048: raise it"):
+    with pytest.raises(ValueError, match=r"view 0.*2048"):
         evaluate(large, views, fixed)
 
 
@@ -172,15 +172,15 @@ def test_progress_counts_the_views(own):
 def test_mistakes_are_named(own):
     with pytest.raises(ValueError, match="no views"):
         evaluated(own.take(np.zeros(0, dtype=int)))
-    with pytest.raises(ValueError, match="renderability has 1 entries for 4 views"):
+    with pytest.raises(ValueError, match=r"renderability.*1.*4"):
         evaluated(own, renderability=[0.5])
-    with pytest.raises(ValueError, match="numbers has 2 entries for 4 views"):
+    with pytest.raises(ValueError, match=r"numbers.*2.*4"):
         evaluated(own, numbers=[1, 2])
     for value in (jnp.nan, jnp.inf):
         broken = eqx.tree_at(lambda s: s.sh, SCENE, SCENE.sh.at[9:11, 2, 1].set(value))
-        with pytest.raises(ValueError, match=r"2 of 60 Gaussians have parameters.*row 9"):
+        with pytest.raises(ValueError, match=r"2 of 60.*row 9"):
             evaluate(broken, own, SLOW)
-    with pytest.raises(ValueError, match="view 7 renders to values that are not finite"):
+    with pytest.raises(ValueError, match="view 7"):
         evaluate(SCENE, own, SLOW, background=WHITE * jnp.nan, numbers=[7, 8, 9, 10])
 
 

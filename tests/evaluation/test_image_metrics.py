@@ -153,7 +153,7 @@ def test_gradients_are_finite_for_flat_and_equal_images():
 
 def test_mistakes_are_named():
     x = jnp.zeros((HEIGHT, WIDTH, 3))
-    with pytest.raises(ValueError, match="at least 11 x 11 px, got 14 x 10"):
+    with pytest.raises(ValueError, match=r"11 x 11.*14 x 10"):
         ssim(x[:10], x[:10])
     unchecked = load(("r3jax.evaluation.image_metrics",))[
         "image_metrics"
@@ -161,7 +161,7 @@ def test_mistakes_are_named():
     for metric in (unchecked.psnr, unchecked.ssim):
         with pytest.raises(ValueError, match=r"\(17, 14, 3\).*\(16, 14, 3\)"):
             metric(x, x[1:])
-    with pytest.raises(ValueError, match=r"valid has shape \(17, 13\)"):
+    with pytest.raises(ValueError, match=r"valid.*\(17, 13\)"):
         unchecked.psnr(x, x, jnp.ones((17, 13), dtype=bool))
 
 

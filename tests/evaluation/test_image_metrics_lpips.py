@@ -161,18 +161,18 @@ def test_vgg_agrees_with_a_published_value():
 
 def test_mistakes_are_named():
     metric, x = load_lpips(), jnp.asarray(noise(15))
-    with pytest.raises(ValueError, match="at least 31 x 31 px, got 30 x 33"):
+    with pytest.raises(ValueError, match=r"31 x 31.*30 x 33"):
         metric(x[:, :, :30], x[:, :, :30])
-    with pytest.raises(ValueError, match="at least 16 x 16 px"):
+    with pytest.raises(ValueError, match="16 x 16"):
         load_lpips("vgg")(x[:, :15], x[:, :15])
     for spoiled in (x + 0.5, x - 0.5, x.at[0, 0, 0, 0].set(jnp.nan)):
-        with pytest.raises(ValueError, match=r"images in \[0, 1\], but truth has values"):
+        with pytest.raises(ValueError, match="truth"):
             metric(x, spoiled)
     # As a user has it, without the tests' type checker.
     unchecked = load(("r3jax.evaluation.image_metrics",))["image_metrics"].load_lpips()
     with pytest.raises(ValueError, match=r"\(3, 33, 41, 3\).*\(3, 32, 41, 3\)"):
         unchecked(x, x[:, 1:])
-    with pytest.raises(ValueError, match="no LPIPS network 'squeeze': choose alex or vgg"):
+    with pytest.raises(ValueError, match=r"'squeeze'.*alex"):
         load_lpips("squeeze")
 
 

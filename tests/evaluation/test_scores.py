@@ -103,9 +103,9 @@ def test_parquet_keeps_every_digit(tmp_path):
 def test_mistakes_are_named(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="no view"):
         summarize([])
-    with pytest.raises(ValueError, match=r"\.csv or \.parquet, not '\.xlsx'"):
+    with pytest.raises(ValueError, match=r"\.parquet.*\.xlsx"):
         write_rows(tmp_path / "rows.xlsx", [row(0)])
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(ImportError, match="pip install pyarrow"):
+    with pytest.raises(ImportError, match="pyarrow"):
         write_rows(tmp_path / "rows.parquet", [row(0)])
     assert not list(tmp_path.iterdir())

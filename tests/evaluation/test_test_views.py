@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from r3jax.errors import InputError
 from r3jax.evaluation import test_views
 from r3jax.evaluation.test_views import (
     ViewSet,
@@ -178,7 +179,7 @@ def law_a_changed_file_is_refused(folder):
         record = json.loads(good)
         change(record)
         path.write_text(json.dumps(record))
-        with pytest.raises(ValueError, match=r"was changed.*delete the file") as caught:
+        with pytest.raises(ValueError, match="delete") as caught:
             test_views.load_view_set(folder, Toy(), max_views=12)
         assert str(path) in str(caught.value)
 
@@ -194,7 +195,7 @@ def test_a_damaged_file_is_refused(tmp_path, text):
     stored(tmp_path)
     (path,) = tmp_path.iterdir()
     path.write_text(text)
-    with pytest.raises(ValueError, match=r"is not a set of test views.*delete the file"):
+    with pytest.raises(ValueError, match="delete"):
         stored(tmp_path)
 
 
@@ -202,7 +203,7 @@ def test_a_file_of_a_later_version_is_told_as_such(tmp_path):
     stored(tmp_path)
     (path,) = tmp_path.iterdir()
     path.write_text('{"format": 2, "unheard": "of"}')
-    with pytest.raises(ValueError, match=r"has format version 2.* use the newer r3jax"):
+    with pytest.raises(ValueError, match="version 2"):
         stored(tmp_path)
 
 
@@ -212,14 +213,14 @@ def test_a_file_of_other_settings_or_another_scene_is_refused(tmp_path):
     stored(tmp_path, max_views=18)
     (other,) = set(tmp_path.iterdir()) - {path}
     other.write_bytes(path.read_bytes())
-    with pytest.raises(ValueError, match="stored for other settings"):
+    with pytest.raises(InputError):
         stored(tmp_path, max_views=18)
     load_view_set(tmp_path / "b", Toy(scene_hash="cd" * 32), max_views=12)
     (foreign,) = (tmp_path / "b").iterdir()
     path.write_bytes(foreign.read_bytes())
-    with pytest.raises(ValueError, match="the scene was changed, or these are another scene's"):
+    with pytest.raises(ValueError, match="scene"):
         stored(tmp_path, max_views=12)
-    with pytest.raises(ValueError, match="the scene was changed, or these are another scene's"):
+    with pytest.raises(ValueError, match="scene"):
         render_view_set(Toy(), read_view_set(foreign), 16)
 
 
@@ -228,7 +229,7 @@ def test_settings_without_views_are_refused():
         compute_view_set(Toy(), max_views=5)
     nowhere = Toy()
     nowhere.free_positions = lambda spacing, margin: np.zeros((0, 3))
-    with pytest.raises(ValueError, match="no test views: of a lattice"):
+    with pytest.raises(InputError):
         compute_view_set(nowhere)
 
 

@@ -49,7 +49,7 @@ def test_the_check_itself_finds_a_collision():
     world = open_scene("flat", camera=Camera.from_fov(16, 16, 60.0), noise=0.0)
     start = world.start_pose[:3, 3]
     outside = world.bounds[1] + 1.0
-    with pytest.raises(AssertionError, match="the mesh lies between"):
+    with pytest.raises(AssertionError):
         assert_no_collision(world, np.stack([start, outside])[None])
 
 

@@ -102,7 +102,7 @@ def test_a_file_that_is_no_capture_says_what_to_do(tmp_path, name, message):
 def test_a_database_of_colmap_says_what_to_do(tmp_path):
     with closing(sqlite3.connect(tmp_path / "database.db")) as connection:
         connection.execute("CREATE TABLE cameras (camera_id INTEGER)")
-    with pytest.raises(FormatError, match="no database of RTAB-Map: of COLMAP give the folder of"):
+    with pytest.raises(FormatError, match="COLMAP"):
         open_capture(tmp_path / "database.db")
 
 

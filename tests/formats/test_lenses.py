@@ -44,10 +44,10 @@ def test_a_camera_comes_back():
     ("fields", "reason"),
     [
         (("EQUIRECTANGULAR", 10, 10, (10.0, 10.0)), "not known"),
-        (("PINHOLE", 10, 10, (10.0, 5.0, 5.0)), "has the 4 parameters fx fy cx cy, got 3"),
+        (("PINHOLE", 10, 10, (10.0, 5.0, 5.0)), "fx fy cx cy.*3"),
         (("PINHOLE", 0, 10, (10.0, 10.0, 5.0, 5.0)), "0 x 10 pixels"),
         (("PINHOLE", 10, 1 << 40, (10.0, 10.0, 5.0, 5.0)), "pixels"),
-        (("PINHOLE", 10, 10, (10.0, 0.0, 5.0, 5.0)), "focal lengths 10 and 0"),
+        (("PINHOLE", 10, 10, (10.0, 0.0, 5.0, 5.0)), "10 and 0"),
         (("PINHOLE", 10, 10, (10.0, 1e30, 5.0, 5.0)), "focal lengths"),
         (("PINHOLE", 10, 10, (10.0, 10.0, 5.0, float("nan"))), "not finite"),
         (("PINHOLE", 10, 10, (10.0, 10.0, 5.0, -1e30)), "principal point"),

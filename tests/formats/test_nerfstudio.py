@@ -161,7 +161,7 @@ def test_applied_transform_is_kept_and_poses_stay_in_the_files_coordinates(folde
     assert moved is not None
     np.testing.assert_array_equal(moved @ [2, 4, 6, 1], [1, 3, -2, 1])
     assert read_transforms(written(folder)).T_capture_original is None
-    assert "so are all lengths here: without depth images that is not undone" in images.remark
+    assert "depth" in images.remark
 
 
 def test_an_applied_scale_is_undone_where_depth_tells_the_units(folder):
@@ -173,7 +173,7 @@ def test_an_applied_scale_is_undone_where_depth_tells_the_units(folder):
     np.testing.assert_array_equal(images.poses[:, :3, :3], metric[:, :3, :3])
     np.testing.assert_array_equal(images.T_capture_original @ [2, 4, 6, 1], [2, 6, -4, 1])
     assert images.points_path is None
-    assert "scaled by 0.5 (applied_scale): that is undone" in images.remark
+    assert "0.5 (applied_scale)" in images.remark
 
 
 def test_depth_is_in_millimeters_unless_the_file_says_otherwise(folder):
@@ -198,11 +198,11 @@ def test_depth_is_in_millimeters_unless_the_file_says_otherwise(folder):
 
 def test_what_is_missing_is_named_when_it_is_read(folder):
     images = read_transforms(written(folder, **{"0.depth_file_path": "gone.png", "1.k1": 0}))
-    with pytest.raises(FormatError, match=r"gone\.png: the file is missing"):
+    with pytest.raises(FormatError, match=r"gone\.png"):
         images.frame(0)
-    with pytest.raises(FormatError, match=r"a\.jpg: there is no depth image"):
+    with pytest.raises(FormatError, match=r"a\.jpg.*depth"):
         images.frame(1)
     (folder / "images" / "b.png").unlink()
     assert len(read_transforms(folder)) == 2
-    with pytest.raises(FormatError, match=r"b\.png: the file is missing"):
+    with pytest.raises(FormatError, match=r"b\.png"):
         images.frame(0)

@@ -82,7 +82,7 @@ def test_tum_without_k_takes_the_benchmarks_camera_for_its_own_size_only(tmp_pat
     files = sequences.tum()
     del files["K.txt"]
     lay_out(tmp_path, files)
-    with pytest.raises(FormatError, match=r"K\.txt: the file is missing, and the images are 10x8"):
+    with pytest.raises(FormatError, match=r"K\.txt.*10x8"):
         read_tum(tmp_path)
     large = sequences.encoded(np.zeros((480, 640, 3), np.uint8))
     lay_out(tmp_path, files | {n: large for n in files if n.startswith("rgb/")})

@@ -174,7 +174,7 @@ def test_under_jit_what_is_not_finite_gives_nan():
     assert np.isnan(panorama(np.array([0.0, np.nan, 0.0], np.float32)))
     assert np.isnan(row(np.array([0.0, np.inf, 0.0], np.float32), 500.0)).all()
     assert np.isnan(row(np.zeros(3, np.float32), -1.0)).all()
-    with pytest.raises(ValueError, match="position is not finite"):
+    with pytest.raises(ValueError, match="position"):
         r3jax.panorama(MAP, GRID, CAMERA, np.array([0.0, np.nan, 0.0]))
-    with pytest.raises(ValueError, match="focal must be positive"):
+    with pytest.raises(ValueError, match="focal"):
         r3jax.voxel_renderability(MAP, np.zeros(3), focal=-1.0)

@@ -134,7 +134,7 @@ def changed(row: int, column: int, value: float) -> np.ndarray:
         (changed(0, 1, 0.1), "not rigid"),
         (np.zeros((4, 4)), "not rigid"),
         (np.diag([1.0, 1.0, -1.0, 1.0]), "OpenGL"),
-        (np.diag([2.0, 2.0, 2.0, 1.0]), "scaled by 2: divide"),
+        (np.diag([2.0, 2.0, 2.0, 1.0]), "2: divide"),
         (changed(3, 0, 0.5), "last row"),
         (changed(3, 3, 2.0), "last row"),
     ],
@@ -153,12 +153,12 @@ def test_rounded_pose_is_accepted():
     [
         ((0, 8, 9.0, 9.0, 4.0, 4.0), "0 x 8"),
         ((8, -1, 9.0, 9.0, 4.0, 4.0), "8 x -1"),
-        ((8, 8, 0.0, 9.0, 4.0, 4.0), "fx must be positive"),
-        ((8, 8, 9.0, -9.0, 4.0, 4.0), "fy must be positive"),
-        ((8, 8, np.nan, 9.0, 4.0, 4.0), "fx must be positive"),
-        ((8, 8, np.inf, 9.0, 4.0, 4.0), "fx must be positive"),
-        ((8, 8, 9.0, 9.0, np.nan, 4.0), "cx must be finite"),
-        ((8, 8, 9.0, 9.0, 4.0, np.inf), "cy must be finite"),
+        ((8, 8, 0.0, 9.0, 4.0, 4.0), "fx"),
+        ((8, 8, 9.0, -9.0, 4.0, 4.0), "fy"),
+        ((8, 8, np.nan, 9.0, 4.0, 4.0), "fx"),
+        ((8, 8, np.inf, 9.0, 4.0, 4.0), "fx"),
+        ((8, 8, 9.0, 9.0, np.nan, 4.0), "cx"),
+        ((8, 8, 9.0, 9.0, 4.0, np.inf), "cy"),
     ],
 )
 def test_bad_intrinsics_are_refused(arguments, words):

@@ -40,7 +40,7 @@ def test_more_room_than_flags_is_padded():
 
 def test_counts_that_float32_cannot_hold_are_refused():
     too_many = jax.ShapeDtypeStruct((1 << 24,), jnp.bool_)
-    with pytest.raises(ValueError, match=r"below 2\^24 flags, got 16777216"):
+    with pytest.raises(ValueError, match="16777216"):
         jax.eval_shape(running_count, too_many)
 
 

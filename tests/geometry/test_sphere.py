@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from r3jax.errors import InputError
 from r3jax.geometry.sphere import (
     bins_for_angle,
     fibonacci_lattice,
@@ -81,7 +82,7 @@ def test_bad_angle_is_refused(angle):
 
 
 def test_empty_lattice_is_refused():
-    with pytest.raises(ValueError, match="at least one direction"):
+    with pytest.raises(InputError):
         fibonacci_lattice(0)
 
 

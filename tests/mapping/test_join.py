@@ -162,16 +162,16 @@ def test_bin_words_set_one_bit(num_bins):
 
 
 def test_maps_that_do_not_fit_are_refused():
-    with pytest.raises(ValueError, match=r"64 and 32 direction bins"):
+    with pytest.raises(ValueError, match=r"64.*32"):
         merge(empty_map(16), empty_map(16, num_bins=32))
-    with pytest.raises(ValueError, match=r"voxels of 0.05.* m and 0.1.* m"):
+    with pytest.raises(ValueError, match=r"0.05.*0.1"):
         merge(empty_map(16), empty_map(16, voxel_size=0.1))
 
 
 def test_bad_capacities_are_refused():
-    with pytest.raises(ValueError, match="cannot shrink a map of 16 rows to 8"):
+    with pytest.raises(ValueError, match=r"16.*8"):
         grow(empty_map(16), 8)
-    with pytest.raises(ValueError, match="power of two >= 2, got 24"):
+    with pytest.raises(ValueError, match="24"):
         grow(empty_map(16), 24)
 
 

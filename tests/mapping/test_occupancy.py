@@ -315,10 +315,10 @@ def test_cells_and_their_centers_are_inverse(grid):
 @pytest.mark.parametrize(
     ("bounds", "cell_size", "message"),
     [
-        ([[0, 0, 0], [1, 1, 0]], 0.2, "lower and an upper corner"),
-        ([[0, 0, 0], [1, 1, np.nan]], 0.2, "lower and an upper corner"),
-        ([0, 0, 0], 0.2, "lower and an upper corner"),
-        ([[0, 0, 0], [1, 1, 1]], 0.0, "cell_size must be positive"),
+        ([[0, 0, 0], [1, 1, 0]], 0.2, "corner"),
+        ([[0, 0, 0], [1, 1, np.nan]], 0.2, "corner"),
+        ([0, 0, 0], 0.2, "corner"),
+        ([[0, 0, 0], [1, 1, 1]], 0.0, "cell_size"),
         ([[0, 0, 0], [9000, 9000, 3000]], 0.2, "in meters"),
     ],
 )

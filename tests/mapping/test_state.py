@@ -28,17 +28,17 @@ def test_a_row_takes_at_most_48_bytes():
 
 @pytest.mark.parametrize("capacity", [0, -4, 1, 3, 100, (1 << 17) + 1])
 def test_bad_capacity_is_refused(capacity):
-    with pytest.raises(ValueError, match=f"capacity must be a power of two >= 2, got {capacity}"):
+    with pytest.raises(ValueError, match=f"capacity.*{capacity}"):
         empty_map(capacity)
 
 
 @pytest.mark.parametrize("voxel_size", [0.0, -0.05, float("nan"), float("inf")])
 def test_bad_voxel_size_is_refused(voxel_size):
-    with pytest.raises(ValueError, match=r"voxel_size must be positive and finite \[m\], got"):
+    with pytest.raises(ValueError, match="voxel_size"):
         empty_map(16, voxel_size)
 
 
 @pytest.mark.parametrize("num_bins", [0, -64])
 def test_no_bins_are_refused(num_bins):
-    with pytest.raises(ValueError, match=f"num_bins must be at least 1, got {num_bins}"):
+    with pytest.raises(ValueError, match=f"num_bins.*{num_bins}"):
         empty_map(16, num_bins=num_bins)

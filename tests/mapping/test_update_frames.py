@@ -176,7 +176,7 @@ def test_a_map_may_be_updated_in_place():
 
 @pytest.mark.parametrize("max_range", [0.0, -1.0, np.nan])
 def test_bad_range_is_named(max_range):
-    with pytest.raises(ValueError, match=r"max_range must be positive \[m\], got"):
+    with pytest.raises(ValueError, match="max_range"):
         integrate(new_map(CAPACITY), FRAMES[0], max_range)
 
 
@@ -217,5 +217,5 @@ def test_a_camera_whose_surroundings_have_no_voxel_index_is_refused():
     far = frame.T_world_camera.at[0, 3].set(12_000.0)
     moved = dataclasses.replace(frame, T_world_camera=far)
     integrate(state, moved)
-    with pytest.raises(ValueError, match=r"12,000 m.* 10,381 m is the most.* origin"):
+    with pytest.raises(ValueError, match=r"12,000 m.*10,381 m"):
         integrate(small, moved)

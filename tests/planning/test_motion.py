@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from r3jax.errors import InputError
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.registry import make_policy
 from r3jax.planning.robot.motion import (
@@ -23,16 +24,16 @@ from r3jax.runs.header import settings_of
 @pytest.mark.parametrize(
     ("wrong", "says"),
     [
-        ({"heights": (0.2, 0.5)}, "heights 0.2 to 0.5 m above the start leave out the start"),
-        ({"heights": (0.5, -0.5)}, "heights 0.5 to -0.5 are upside down"),
-        ({"heights": (0.0, math.inf)}, "heights must be two finite numbers"),
-        ({"elevations": (-100.0, 0.0)}, "elevations must lie between -90"),
-        ({"elevations": (10.0, -10.0)}, "elevations 10 to -10 are upside down"),
-        ({"body": -0.1}, "body must be a finite length"),
-        ({"speed": 0.0}, "speed must be positive and finite"),
-        ({"speed": 1e-310}, "speed must be positive and finite, at least 0.001"),
-        ({"turn_per_meter": math.nan}, "turn_per_meter must be positive and finite"),
-        ({"turn_rate": 30.0}, "turn_rate needs speed"),
+        ({"heights": (0.2, 0.5)}, "heights 0.2 to 0.5 m"),
+        ({"heights": (0.5, -0.5)}, "heights 0.5 to -0.5"),
+        ({"heights": (0.0, math.inf)}, "heights"),
+        ({"elevations": (-100.0, 0.0)}, "elevations"),
+        ({"elevations": (10.0, -10.0)}, "elevations 10 to -10"),
+        ({"body": -0.1}, "body"),
+        ({"speed": 0.0}, "speed"),
+        ({"speed": 1e-310}, "speed"),
+        ({"turn_per_meter": math.nan}, "turn_per_meter"),
+        ({"turn_rate": 30.0}, "turn_rate"),
     ],
 )
 def test_what_nothing_can_move_with_is_refused(wrong, says):
@@ -44,9 +45,9 @@ def test_a_motion_by_name_takes_changes():
     slow = make_motion("ground", speed=0.1, heights=(0.0, 0.3))
     assert slow == dataclasses.replace(MOTIONS["ground"], speed=0.1, heights=(0.0, 0.3))
     assert make_motion() == Motion()
-    with pytest.raises(ValueError, match="unknown motion 'boat'; known: free, ground, gimbal"):
+    with pytest.raises(ValueError, match=r"'boat'.*gimbal"):
         make_motion("boat")
-    with pytest.raises(ValueError, match="no setting wheels; known: heights, heights_above"):
+    with pytest.raises(ValueError, match=r"wheels.*heights_above"):
         make_motion("ground", wheels=4)
 
 
@@ -86,9 +87,9 @@ def test_a_record_without_refinement_reads_as_it_always_did():
 
 
 def test_a_damaged_record_is_refused():
-    with pytest.raises(ValueError, match="a motion has no setting legs"):
+    with pytest.raises(ValueError, match="legs"):
         motion_of_record({"legs": 2})
-    with pytest.raises(ValueError, match="a motion must be an object"):
+    with pytest.raises(InputError):
         motion_of_record("ground")
 
 

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import r3jax
+from r3jax.errors import InputError
 from r3jax.geometry.cameras import look_at
 from r3jax.planning import next_views as real
 from r3jax.scoring.batch import score_positions, score_views, score_views_near
@@ -132,15 +133,15 @@ def test_what_cannot_be_chosen_from_is_refused():
     state, grid = known()
     poses = poses_of(0)
     ask = functools.partial(r3jax.next_views, state, grid, CAMERA, config=CONFIG)
-    with pytest.raises(ValueError, match="k must be at least 1"):
+    with pytest.raises(ValueError, match=r"k .*1"):
         ask(0, poses=poses)
-    with pytest.raises(ValueError, match="cannot choose 25 views from 24 poses"):
+    with pytest.raises(ValueError, match=r"25.*24"):
         ask(25, poses=poses)
     with pytest.raises(ValueError, match=r"shape \[C, 4, 4\]"):
         ask(1, poses=poses[0])
     poses[2, 0, 0] = np.nan
-    with pytest.raises(ValueError, match=r"pose 2: .*not finite"):
+    with pytest.raises(ValueError, match="pose 2"):
         ask(1, poses=poses)
     unknown = eqx.tree_at(lambda g: g.log_odds, grid, jnp.zeros_like(grid.log_odds))
-    with pytest.raises(ValueError, match="no free cell with the safety margin"):
+    with pytest.raises(InputError):
         r3jax.next_views(state, unknown, CAMERA, 1, config=CONFIG)

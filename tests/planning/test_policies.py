@@ -258,11 +258,11 @@ def test_an_unknown_name_lists_the_known_ones():
     for call in (make_policy, describe, source_of):
         with pytest.raises(ValueError, match=r"'best'.*r3, r3-pano, .*random"):
             call("best")
-        with pytest.raises(ValueError, match=r"'ours-demand' has left the package: .* e43d800"):
+        with pytest.raises(ValueError, match=r"'ours-demand'.*e43d800"):
             call("ours-demand")
-        with pytest.raises(ValueError, match=r"'uniform' has left the package: .* fb13156"):
+        with pytest.raises(ValueError, match=r"'uniform'.*fb13156"):
             call("uniform")
-    with pytest.raises(ValueError, match=r"no setting speed; known: num_candidates"):
+    with pytest.raises(ValueError, match=r"speed.*num_candidates"):
         make_policy("r3", speed=1.0)
 
 

@@ -75,10 +75,10 @@ def test_the_policy_of_the_page_is_benchmarked_by_workers(here):
 @pytest.mark.parametrize(
     ("name", "says"),
     [
-        ("nowhere.at:All", "there is no module nowhere.at"),
-        ("my_policy:Lowest", "has no attribute 'Lowest'"),
-        ("my_policy:dataclass", "has no class attribute `name`"),
-        ("my_policy", "unknown policy 'my_policy'"),
+        ("nowhere.at:All", "nowhere.at"),
+        ("my_policy:Lowest", "'Lowest'"),
+        ("my_policy:dataclass", "`name`"),
+        ("my_policy", "'my_policy'"),
     ],
 )
 def test_a_class_that_is_not_there_is_told(here, name, says, capsys):
@@ -122,7 +122,7 @@ def test_a_registered_policy_has_settings_of_its_own(empty):
 
     assert r3jax.make_policy("eager", eagerness=0.9, lambda2=0.1).config.eagerness == 0.9
     assert registry.describe("eager") == "Is eager."
-    with pytest.raises(ValueError, match=r"has no setting haste; known: .*eagerness"):
+    with pytest.raises(ValueError, match=r"haste.*eagerness"):
         r3jax.make_policy("eager", haste=1.0)
 
 
@@ -130,9 +130,9 @@ def test_names_are_not_taken_twice(empty):
     class R3(r3jax.GreedyPolicy):
         name = "r3"
 
-    with pytest.raises(ValueError, match="a policy of this package is called 'r3'"):
+    with pytest.raises(ValueError, match="'r3'"):
         r3jax.register_policy(R3)
-    with pytest.raises(ValueError, match="needs a class attribute `name`"):
+    with pytest.raises(ValueError, match="`name`"):
         r3jax.register_policy(dict)
 
 

@@ -194,4 +194,4 @@ def test_a_camera_outside_of_the_bounds_is_told():
     planner = r3jax.start(CAMERA, BOUNDS, "random")
     decision, _, info = r3jax.decide(planner, pose_at(9.0, 9.0), jax.random.key(0))
     assert decision is None
-    assert "outside of the bounds" in info.reason
+    assert "bounds" in info.reason

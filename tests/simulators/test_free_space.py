@@ -212,7 +212,7 @@ def test_bad_settings_are_refused(spacing, margin, words):
 
 def test_a_world_too_large_is_refused():
     quads = [*furnished([]), quad((0, 0, -1.0), x=3000, y=3000)]
-    with pytest.raises(ValueError, match="is the unit meters"):
+    with pytest.raises(ValueError, match="meters"):
         truth_of(quads).free_positions(SPACING, 0.3)
 
 
@@ -249,7 +249,7 @@ def test_what_has_no_mesh_is_refused():
         def render(self, T_world_camera):
             raise NotImplementedError
 
-    with pytest.raises(ValueError, match="a Recorded has no mesh"):
+    with pytest.raises(ValueError, match="Recorded"):
         GroundTruth(Recorded())
 
 

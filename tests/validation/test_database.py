@@ -71,7 +71,7 @@ def test_a_query_ends(tmp_path, monkeypatch):
         f"FROM ({ENDLESS})", "CREATE VIEW large AS SELECT zeroblob(600000000)",
     )  # fmt: skip
     monkeypatch.setattr(database, "_MAX_ROWS", 1000)
-    with pytest.raises(ForeignFileError, match="more than 1,000 rows"):
+    with pytest.raises(ForeignFileError, match="1,000"):
         query_database(path, "SELECT i FROM rows")
     with pytest.raises(sqlite3.Error, match="too big"):
         query_database(path, "SELECT * FROM large")

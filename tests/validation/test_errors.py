@@ -13,10 +13,10 @@ def test_the_versions_between_are_read():
 @pytest.mark.parametrize(
     ("found", "message"),
     [
-        (5, "format version 5, this package reads versions 2 to 4: use the newer r3jax"),
-        (1, "format version 1, .* use the other r3jax"),
-        (None, "format version None"),
-        (True, "format version True"),
+        (5, "version 5.*2 to 4"),
+        (1, "version 1"),
+        (None, "None"),
+        (True, "True"),
         ("3", "format version 3"),
         (3.0, "format version 3.0"),
         ("x" * 1000, "format version x{20},"),

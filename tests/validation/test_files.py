@@ -58,7 +58,7 @@ def test_what_is_no_file_is_not_opened(tmp_path, kind):
 def test_a_pipe_or_a_dead_link_in_a_folder(tmp_path):
     (tmp_path / "deep").mkdir()
     os.mkfifo(tmp_path / "deep" / "pipe")
-    with pytest.raises(ForeignFileError, match="pipe: this is a pipe"):
+    with pytest.raises(ForeignFileError, match="pipe"):
         check_tree(tmp_path)
     os.remove(tmp_path / "deep" / "pipe")
     (tmp_path / "deep" / "link").symlink_to("nowhere")

@@ -31,9 +31,9 @@ def test_what_is_written_is_read(tree):
     ("data", "reason"),
     [
         (b'{"a": 1, "b": {"c": 1, "c": 1}}', "'c' occurs twice"),
-        (b"[NaN]", "NaN is no number"),
-        (b"[-Infinity]", "-Infinity is no number"),
-        (b"[1e999]", "1e999 is too large"),
+        (b"[NaN]", "NaN"),
+        (b"[-Infinity]", "-Infinity"),
+        (b"[1e999]", "1e999"),
         (b"[9223372036854775808]", "is too large"),
         (b"1" * 5000, "is too large"),
         (b"[" * 100_000, "nested too deeply"),
@@ -55,7 +55,7 @@ def test_both_halves_of_a_character_are_one():
 @pytest.mark.parametrize("part", ["[]", "{}", "1.5"])
 def test_more_values_than_fit_into_memory_are_refused_unread(part):
     text = "[" + ",".join([part] * 4_100_000) + "]"
-    with pytest.raises(ForeignFileError, match="more than 4,000,000 values"):
+    with pytest.raises(ForeignFileError, match="4,000,000"):
         parse_json(text)
 
 
@@ -90,15 +90,15 @@ def test_a_record_is_built():
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"count": 3.0}, "`count` must be int"),
-        ({"count": True}, "`count` must be int"),
-        ({"length": "2"}, "`length` must be float"),
-        ({"length": float("nan")}, "`length` must be float"),
-        ({"length": True}, "`length` must be float"),
-        ({"name": None}, "`name` must be str"),
-        ({"costs": {"x": "1"}}, "`costs` must be"),
-        ({"costs": [1.0]}, "`costs` must be"),
-        ({"row": [1.0, "x"]}, "`row` must be"),
+        ({"count": 3.0}, "`count`"),
+        ({"count": True}, "`count`"),
+        ({"length": "2"}, "`length`"),
+        ({"length": float("nan")}, "`length`"),
+        ({"length": True}, "`length`"),
+        ({"name": None}, "`name`"),
+        ({"costs": {"x": "1"}}, "`costs`"),
+        ({"costs": [1.0]}, "`costs`"),
+        ({"row": [1.0, "x"]}, "`row`"),
         ({"surprise": 1}, "unknown 'surprise'"),
     ],
 )
@@ -108,11 +108,11 @@ def test_another_type_is_named(change, reason):
 
 
 def test_a_missing_field_is_named():
-    with pytest.raises(ForeignFileError, match=r"the Record .* name"):
+    with pytest.raises(ForeignFileError, match=r"Record.*name"):
         build(Record, {k: v for k, v in PLAIN.items() if k != "name"})
     with pytest.raises(ForeignFileError, match=r"`thing` .* b"):
         check_fields("thing", {"a": 1}, {"a": int, "b": str | None})
-    with pytest.raises(ForeignFileError, match="expected the fields of a Record, got"):
+    with pytest.raises(ForeignFileError, match="Record"):
         build(Record, [1])
 
 

@@ -75,7 +75,7 @@ def test_a_cell_that_fails_does_not_stop_the_others(finished, room, tmp_path):
 
 def test_no_process_is_started_without_work_and_none_below_one(tmp_path):
     run_in_processes([], tmp_path, print, jobs=3)
-    with pytest.raises(ValueError, match="jobs must be at least 1, got 0"):
+    with pytest.raises(ValueError, match=r"jobs.*0"):
         run_in_processes([], tmp_path, print, jobs=0)
 
 

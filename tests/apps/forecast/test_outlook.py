@@ -132,12 +132,12 @@ def test_frames_on_the_way_are_no_views(whole):
 
 def test_a_goal_that_nobody_checks_is_refused():
     config = dataclasses.replace(CONFIG, until="psnr:20")
-    with pytest.raises(ValueError, match=r"config\.until is 'psnr:20', is_enough is not given"):
+    with pytest.raises(ValueError, match="is_enough"):
         explore(BoxRoom(), small_policy("random"), budget="views:1", config=config)
 
 
 def test_a_goal_that_is_none_is_refused():
-    with pytest.raises(ValueError, match="goal 'ssim:1' is not understood"):
+    with pytest.raises(ValueError, match="'ssim:1'"):
         stopping_rule(dataclasses.replace(CONFIG, until="ssim:1"), BoxRoom().camera)
-    with pytest.raises(ValueError, match="until_every must be at least 1"):
+    with pytest.raises(ValueError, match="until_every"):
         dataclasses.replace(CONFIG, until_every=0)

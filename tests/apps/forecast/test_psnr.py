@@ -15,6 +15,7 @@ from r3jax.apps.forecast.psnr import (
     default_calibration,
     parse_goal,
 )
+from r3jax.errors import InputError
 
 TRUE = PsnrModel((5.0, 20.0, -6.0, 8.0), (0.5, 0.4, -0.6), (-1.0, 0.0, 1.0))
 seeds = st.integers(0, 1000)
@@ -104,17 +105,17 @@ def test_the_package_knows_its_errors():
 
 @pytest.mark.parametrize("name", ["p0", "p100", "10", "pp", "median", "p-5", ""])
 def test_what_is_no_statistic_is_told(name):
-    with pytest.raises(ValueError, match="is no statistic of views"):
+    with pytest.raises(InputError):
         real.percent_of(name)
 
 
 def test_a_fit_refuses_what_it_cannot_use():
     coverage, renderability, psnr = views_of(0, 200)
-    with pytest.raises(ValueError, match="at least 100 views"):
+    with pytest.raises(ValueError, match="100"):
         real.fit(coverage[:50], renderability[:50], psnr[:50])
-    with pytest.raises(ValueError, match="psnr must be finite, view 7 is not"):
+    with pytest.raises(ValueError, match="view 7"):
         real.fit(coverage, renderability, np.where(np.arange(200) == 7, np.nan, psnr))
-    with pytest.raises(ValueError, match="two are needed"):
+    with pytest.raises(InputError):
         real.leave_one_out(coverage, renderability, psnr, ["a"] * 200, ["m"] * 200)
 
 

@@ -162,7 +162,7 @@ def test_a_run_that_cannot_be_explained_has_a_report_all_the_same(reported, tmp_
     shutil.rmtree(tmp_path / "merged" / "report")
     merged = dataclasses.replace(run, path=tmp_path / "merged", header=header)
     page = write_report(merged, result.state.map_state, result.state.grid)
-    assert "Not known: it was merged from runs with separate maps." in page.read_text()
+    assert "Not known" in page.read_text()
     assert not (page.parent / "reasons.png").exists()
 
 

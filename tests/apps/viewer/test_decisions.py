@@ -44,14 +44,14 @@ def test_the_scores_are_those_of_the_trace(run, offers):
 
 def test_another_policy_is_found_out(run, plan):
     other = make_policy("frontier", num_candidates=20, num_frontier=6)
-    with pytest.raises(RunError, match="decides otherwise today than it did at view 1"):
+    with pytest.raises(RunError, match="view 1"):
         dict(decide_again(run, other, plan.config))
 
 
 def test_a_merged_run_is_refused(run, plan):
     header = dataclasses.replace(run.header, parent={"merged": ["a", "b"], "merged_views": [2, 3]})
     merged = dataclasses.replace(run, header=header)
-    with pytest.raises(RunError, match="merged from runs"):
+    with pytest.raises(RunError, match="merged"):
         dict(decide_again(merged, plan.policy, plan.config))
 
 

@@ -80,5 +80,5 @@ def test_colors_of_corners_come_along():
 
 def test_too_many_triangles_are_refused(monkeypatch):
     monkeypatch.setattr(recorded, "MAX_FACES", 2)
-    with pytest.raises(ValueError, match="3 triangles, more than the 2"):
+    with pytest.raises(ValueError, match=r"3.*2"):
         world_glb(make_world())

@@ -106,5 +106,5 @@ def test_a_run_that_is_gone_on_with_shows_its_earlier_views(run, world, server):
         np.testing.assert_array_equal(
             feed.app.story.image(2), (np.asarray(run.frame(2).rgb) * 255).round().astype(np.uint8)
         )
-        with pytest.raises(LookupError, match="no view yet"):
+        with pytest.raises(LookupError):
             feed.app.story.moment(2)

@@ -41,14 +41,14 @@ def test_offsets_are_those_of_a_compiler(tmp_path):
 @pytest.mark.parametrize(
     ("before", "after", "said"),
     [
-        ("  XLA_FFI_DataType dtype;\n  void* data;", "  void* data;", "Buffer.data lies at 16"),
+        ("  XLA_FFI_DataType dtype;\n  void* data;", "  void* data;", "Buffer.data.*16"),
         ("  int64_t* dims;", "  size_t* dims;", ""),
-        ("  int64_t* dims;", "  int64_t more;\n  int64_t* dims;", "Buffer.dims lies at 48"),
+        ("  int64_t* dims;", "  int64_t more;\n  int64_t* dims;", "Buffer.dims.*48"),
         ("  int64_t* dims;", "  size_t* dims;\n  int64_t more;", ""),
         # A struct that lies in another moves what follows it, even where it grows at its end.
-        ("  void** args;", "  void** args;\n  void* more;", "CallFrame.rets.rets lies at 120"),
-        ("  XLA_FFI_Args args;", "  XLA_FFI_Arguments args;", "args.args lies at no place"),
-        ("struct XLA_FFI_Buffer {", "struct XLA_FFI_Tensor {", "Buffer.data lies at no place"),
+        ("  void** args;", "  void** args;\n  void* more;", "CallFrame.rets.rets.*120"),
+        ("  XLA_FFI_Args args;", "  XLA_FFI_Arguments args;", "args.args"),
+        ("struct XLA_FFI_Buffer {", "struct XLA_FFI_Tensor {", "Buffer.data"),
         ("#define XLA_FFI_API_MAJOR 0", "#define XLA_FFI_API_MAJOR 1", "MAJOR is not 0"),
         ("XLA_FFI_Extension_Metadata = 1", "XLA_FFI_Extension_Metadata = 12", "is not 1"),
         ("#define XLA_FFI_API_MINOR ", "#define XLA_FFI_API_MINOR 9", ""),
@@ -57,7 +57,7 @@ def test_offsets_are_those_of_a_compiler(tmp_path):
 def test_a_header_that_changed_is_read_only_where_no_field_moved(header, before, after, said):
     assert header.count(before) == 1
     found = misread_in(header.replace(before, after))
-    assert said in found if said else found == ""
+    assert re.search(said, found) if said else found == ""
 
 
 def test_no_header_is_a_problem():

@@ -15,6 +15,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from r3jax.errors import InputError
 from r3jax.geometry.cameras import Camera
 from r3jax.simulators.base import NoisySimulator, Simulator
 from r3jax.simulators.habitat import habitat
@@ -181,7 +182,7 @@ def test_another_world_is_noticed(tmp_path, monkeypatch):
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     installed(FakeHabitat(ray_cast(room, CAMERA, turn)), monkeypatch)
     simulator = habitat.HabitatSimulator(room.mesh, CAMERA)
-    with pytest.raises(ValueError, match="Habitat shows another world, or the same turned"):
+    with pytest.raises(InputError):
         _ = simulator.start_pose
 
 
@@ -242,7 +243,7 @@ def test_what_habitat_cannot_show_is_refused(room, monkeypatch):
     installed(FakeHabitat(recorded(room)), monkeypatch)
     wall = np.eye(4)
     wall[:3, 3] = load_world(room.mesh, "z").vertices[0]
-    with pytest.raises(ValueError, match="the start at"):
+    with pytest.raises(ValueError, match="start"):
         habitat.HabitatSimulator(room.mesh, CAMERA, up=room.up, start_pose=wall)
     with pytest.raises(ValueError, match="not rigid"):
         habitat.HabitatSimulator(room.mesh, CAMERA, up=room.up).render(2.0 * np.eye(4))
@@ -252,7 +253,7 @@ def test_what_habitat_cannot_show_is_refused(room, monkeypatch):
 
 def test_without_habitat_it_says_how_to_get_it(room, monkeypatch):
     monkeypatch.setitem(sys.modules, "habitat_sim", None)
-    with pytest.raises(ImportError, match=r"conda install habitat-sim headless.*mesh:<file>"):
+    with pytest.raises(ImportError, match=r"conda install habitat-sim.*mesh:<file>"):
         habitat.HabitatSimulator(room.mesh, CAMERA, up=room.up)
 
 
@@ -279,7 +280,7 @@ def test_lines_are_warned_of(tmp_path, monkeypatch):
     scene.add_geometry(trimesh.load_path(np.array([[0.0, 0, 0], [1, 1, 1]])))
     scene.export(tmp_path / "a.glb")
     installed(FakeHabitat(lambda position, rotation: (None, None)), monkeypatch)
-    with pytest.warns(UserWarning, match="1 meshes of lines: Habitat draws them, no ray meets"):
+    with pytest.warns(UserWarning, match="1 meshes"):
         habitat.HabitatSimulator(tmp_path / "a.glb", CAMERA)
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from r3jax.errors import InputError
 from r3jax.simulators.scenes.procedural import shapes
 from r3jax.simulators.scenes.procedural.materials import patterns, textures
 from r3jax.simulators.scenes.procedural.materials.textures import cloud
@@ -23,7 +24,7 @@ def test_a_box_has_its_volume_however_it_is_cut():
 
 
 def test_a_flat_box_is_refused():
-    with pytest.raises(ValueError, match="a box needs positive edges"):
+    with pytest.raises(InputError):
         shapes.box((0, 0, 0), (1, 0, 1))
 
 
@@ -101,5 +102,5 @@ def test_textures_repeat_without_a_seam(texture):
 
 
 def test_an_unknown_motif_lists_the_known_ones():
-    with pytest.raises(ValueError, match=r"unknown wallpaper motif 'dots'.*botanical"):
+    with pytest.raises(ValueError, match=r"'dots'.*botanical"):
         patterns.wallpaper((1.0, 1.0, 1.0), ((0.0, 0.0, 0.0),), "dots", 1)

@@ -153,7 +153,7 @@ def test_without_the_package_the_error_names_the_extra(monkeypatch):
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="there is a GPU")
 def test_without_a_gpu_the_error_names_the_platform(monkeypatch):
     monkeypatch.setitem(sys.modules, "splax", SimpleNamespace())
-    with pytest.raises(RuntimeError, match="needs an NVIDIA GPU, and JAX runs on 'cpu'"):
+    with pytest.raises(RuntimeError, match="'cpu'"):
         splax.load_splax()
 
 

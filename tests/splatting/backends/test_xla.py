@@ -142,7 +142,7 @@ def _configured(config, scene, camera, pose, offsets, _):
 
 def test_sizes_below_one_are_refused():
     config = RasterConfig(gaussians_per_chunk=0)
-    with pytest.raises(ValueError, match="gaussians_per_chunk must be at least 1, got 0"):
+    with pytest.raises(ValueError, match=r"gaussians_per_chunk.*0"):
         composite(xla.rasterize, random_cloud(1, 2), *view(*SIZE), config=config)
 
 

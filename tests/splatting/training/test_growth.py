@@ -82,5 +82,5 @@ def test_only_what_is_new_is_born(views):
 
 
 def test_growth_leaves_no_checkpoints(views, tmp_path):
-    with pytest.raises(ValueError, match="give no folder"):
+    with pytest.raises(ValueError, match="folder"):
         fit(views, config(), folder=tmp_path, growth=Growth(5, lambda s, x: Addition(views)))

@@ -226,7 +226,7 @@ def test_without_depth_only_a_key_helps():
             np.full(views.depth.shape, nothing),
             np.asarray(views.T_world_camera),
         )
-        with pytest.raises(ViewsError, match="none of the 4 views has a depth"):
+        with pytest.raises(ViewsError, match="4 views"):
             initialize(blind, 100)
         scene = initialize(blind, 100, 120, key=jax.random.key(3))
         assert int(scene.is_alive.sum()) == 100
@@ -245,10 +245,10 @@ def test_without_depth_only_a_key_helps():
     [
         ({"num_gaussians": 0}, "got 0 and 3"),
         ({"sh_degree": 4}, "100000 and 4"),
-        ({"voxel_size": 0.0}, "voxel_size must be positive"),
-        ({"voxel_size": float("nan")}, "voxel_size must be positive"),
+        ({"voxel_size": 0.0}, "voxel_size"),
+        ({"voxel_size": float("nan")}, "voxel_size"),
         ({"voxel_size": 1e-7}, "too small for points that span"),
-        ({"num_gaussians": 500, "capacity": 100}, "do not fit in a capacity of 100"),
+        ({"num_gaussians": 500, "capacity": 100}, "capacity of 100"),
     ],
 )
 def test_bad_settings(arguments, message):

@@ -81,29 +81,29 @@ def test_the_newest_two_are_kept_and_an_end_is_always_saved(views, interrupted, 
 
 def test_another_budget_may_resume_but_other_settings_are_named(views, folder):
     changed = config(rate_sh=1e-3, iterations=50)
-    with pytest.raises(CheckpointError, match=r"iterations \(stored 40, now 50\), rate_sh"):
+    with pytest.raises(CheckpointError, match=r"iterations.*40.*50.*rate_sh"):
         fit(views, changed, folder=folder, resume=True)
     other = views.take(np.arange(7))
-    with pytest.raises(CheckpointError, match=r"views \(stored 8, now 7\)"):
+    with pytest.raises(CheckpointError, match=r"views.*8.*7"):
         fit(other, config(), folder=folder, resume=True)
     fit(views, config(raster=type(ROOMY)(backend="numba")), folder=folder, resume=True)
 
 
 def test_a_new_training_does_not_bury_an_old_one(views, folder):
-    with pytest.raises(CheckpointError, match="resume it, overwrite it, or choose another folder"):
+    with pytest.raises(CheckpointError, match="overwrite"):
         fit(views, config(), folder=folder)
 
 
 @pytest.mark.parametrize("how", [{"resume": True}, {"overwrite": True}])
 def test_two_processes_cannot_train_in_one_folder(views, folder, how):
     before = sorted(folder.rglob("*"))
-    with lock_folder(folder), pytest.raises(CheckpointError, match="another process is training"):
+    with lock_folder(folder), pytest.raises(CheckpointError):
         fit(views, config(), folder=folder, **how)
     assert sorted(folder.rglob("*")) == before
 
 
 def test_nothing_to_resume_from(views, tmp_path):
-    with pytest.raises(CheckpointError, match="no checkpoint to resume from"):
+    with pytest.raises(CheckpointError):
         fit(views, config(), folder=tmp_path, resume=True)
 
 
@@ -125,7 +125,7 @@ def test_a_damaged_checkpoint_costs_the_steps_since_the_one_before(views, folder
 def test_what_cannot_be_read_is_named(views, folder):
     for name in ("0000012", "0000020"):
         damage(folder / name)
-    with pytest.raises(CheckpointError, match=r"0000012: cannot be read .*SHA-256"):
+    with pytest.raises(CheckpointError, match=r"0000012.*SHA-256"):
         fit(views, config(), folder=folder, resume=True)
 
 
@@ -140,7 +140,7 @@ def test_nothing_of_the_user_is_deleted(views, folder, tmp_path):
     assert all(path.exists() for path in mine)
     assert sorted(path.name for path in folder.iterdir()) == ["0000098", "0000099", "2019"]
     (tmp_path / "link").symlink_to(tmp_path / "victim")
-    with pytest.raises(OSError, match="must not be a link"):
+    with pytest.raises(OSError, match="link"):
         fit(views, config(), folder=tmp_path / "link")
     assert mine[2].exists()
 
@@ -159,7 +159,7 @@ def test_a_checkpoint_of_an_earlier_version_is_read(tmp_path):
 @pytest.mark.parametrize("text", ["", "[]", '{"format":'])
 def test_settings_that_cannot_be_read_are_named(views, folder, text):
     (folder / "training.json").write_text(text)
-    with pytest.raises(CheckpointError, match=r"training\.json: cannot be read"):
+    with pytest.raises(CheckpointError, match=r"training\.json"):
         fit(views, config(), folder=folder, resume=True)
 
 
@@ -173,7 +173,7 @@ def test_settings_are_stored_as_plain_numbers(folder):
 def test_a_training_of_a_later_version_is_told_as_such(views, folder):
     path = folder / "training.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"format": 2}))
-    with pytest.raises(CheckpointError, match="use the newer r3jax"):
+    with pytest.raises(CheckpointError, match="newer"):
         fit(views, config(), folder=folder, resume=True)
 
 

@@ -164,7 +164,7 @@ def test_numbered_frames_come_in_as_they_are_whole(tmp_path):
 
 def test_without_depth_images_there_is_no_guidance(tmp_path):
     path = write_nerfstudio(tmp_path / "bare", POSES, depth=False)
-    with pytest.raises(ValueError, match="needs depth images"):
+    with pytest.raises(ValueError, match="depth"):
         GrowingCapture(path, tmp_path / "scratch").look()
 
 
@@ -190,5 +190,5 @@ def test_a_bag_that_is_recorded_comes_in_by_and_by(tmp_path, monkeypatch):
 
 def test_a_bag_that_cannot_be_followed_ends_it(tmp_path):
     (tmp_path / "drive.db3").touch()
-    with pytest.raises(ValueError, match="may stop the recorder"):
+    with pytest.raises(ValueError, match="mcap"):
         GrowingCapture(tmp_path, tmp_path / "scratch").look()
