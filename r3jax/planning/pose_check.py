@@ -41,9 +41,8 @@ _MAX_OF_FITTING = 0.25
 _SUSPECTED = 3
 """Pairs in a row before another convention is suggested: walls of two rooms may fit by chance."""
 
-_MAX_APART = 1.0
-"""Cameras farther apart than this [m] suggest no other convention: in a robot's mission whose views
-lie meters apart, walls of two rooms fit in one pair of ten."""
+_UPRIGHT = 0.5
+"""From this cosine on between the image's downward axis and the world's, a camera is upright."""
 
 _MAX_FRAMES = 200
 """Number of frames after which the test is given up: a camera that hardly moves is never
@@ -110,14 +109,25 @@ def check_poses(reference: Reference | None, frame: Frame) -> Reference:
         if suspect and shares[suspect] > _MAX_OF_FITTING:
             # Frames in their true convention never contradict, so the earlier fit was chance.
             return replace(now, suspect="", num_suspected=0)
-        apart = np.linalg.norm(now.T_world_camera[:3, 3] - reference.T_world_camera[:3, 3])
-        if not fits or fitting == "ros" or apart > _MAX_APART:
+        # A robot's views lie meters apart, and in one pair of ten its walls fit backwards, too. Its
+        # camera is upright, which it would not be if its convention were another one.
+        if not fits or fitting == "ros" or _is_upright(now.T_world_camera, "opencv"):
             return replace(now, suspect=suspect, num_suspected=reference.num_suspected)
         pairs = reference.num_suspected + 1 if fitting == reference.suspect else 1
-        if pairs >= _SUSPECTED:
+        if pairs >= _SUSPECTED or _is_upright(now.T_world_camera, fitting):
             _warn("frames overlap that should not", fitting, fits)
             return replace(now, is_settled=True)
         return replace(now, suspect=fitting, num_suspected=pairs)
+    if not _is_upright(now.T_world_camera, "opencv") and any(
+        _is_upright(now.T_world_camera, name) for name in shares
+    ):
+        # Upside down, or rolled: that these two frames fit may be chance.
+        return replace(now, suspect=reference.suspect, num_suspected=reference.num_suspected)
+    if not _is_upright(now.T_world_camera, "opencv") and any(
+        _is_upright(now.T_world_camera, name) for name in shares
+    ):
+        # Upside down, or rolled: that these two frames fit may be chance.
+        return replace(now, suspect=reference.suspect, num_suspected=reference.num_suspected)
     # Finished once every other convention would have been detected in the same pair.
     if all(not share <= _MAX_CONTRADICTED for share in shares.values()):
         return replace(reference, is_settled=True)
@@ -125,6 +135,10 @@ def check_poses(reference: Reference | None, frame: Frame) -> Reference:
     return replace(
         reference, num_compared=num, is_settled=now.is_settled, suspect="", num_suspected=0
     )
+
+
+def _is_upright(T_world_camera: np.ndarray, convention: str) -> bool:
+    return bool(-to_camera_to_world(T_world_camera, convention)[2, 1] >= _UPRIGHT)
 
 
 def _warn(finding: str, fitting: str, fits: bool) -> None:

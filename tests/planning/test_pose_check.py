@@ -105,6 +105,16 @@ def test_wrong_poses_are_noticed_as_soon_as_the_camera_turns(place, yaw, convent
     assert not observed(frames, poses_of(frames))[0]
 
 
+def test_backward_poses_of_a_robot_are_noticed_though_a_pair_fits_by_chance():
+    """Views apart from each other do not settle the question while the camera is upside down."""
+    places = [((-1.5, 0.0, 1.0), 180.0), ((1.5, 0.0, 1.0), 0.0), ((0.0, -1.0, 1.0), -90.0)]
+    frames = [in_room(place, yaw, 0.0) for place, yaw in places]
+    frames += [in_room((0.0, 0.0, 1.0), 40.0 * step, 0.0) for step in range(6)]
+    said, _ = observed(frames, [misread(T, "opengl") for T in poses_of(frames)])
+    assert len(said) == 1
+    assert not observed(frames, poses_of(frames))[0]
+
+
 def test_a_camera_that_stands_still_settles_nothing():
     frames = [in_room((0.0, 0.0, 1.0), 30.0, 0.0)] * 5
     said, reference = observed(frames, [misread(T, "opengl") for T in poses_of(frames)])
