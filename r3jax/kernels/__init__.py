@@ -1,7 +1,7 @@
-"""Machine code for CPUs: formulas of other packages again, as batched functions of arrays.
+"""Machine code for CPUs: formulas of other packages as batched functions of arrays.
 
 `calls` has them under the names below, `bridge` is how XLA reaches them, `native` how they are
-compiled. Each is held to its formula by a test.
+compiled. A test compares each with its formula.
 
 | kernel | formula | test, in `tests` |
 |---|---|---|

@@ -1,4 +1,4 @@
-"""The kernels as XLA's custom calls: each reads its arguments and runs."""
+"""The kernels as XLA's custom calls, which read their arguments and run a kernel."""
 
 # Kernels have the types that Numba infers where they are called; annotations it would not read.
 # pyright: reportMissingParameterType=false, reportUnknownParameterType=false
@@ -39,7 +39,7 @@ from r3jax.kernels.splatting.tallies import tallies_pass
 from r3jax.kernels.training.adam import adam_pass
 from r3jax.kernels.training.image_loss import loss_pass
 
-# Places of arguments are literals, so that LLVM sees through all of this.
+# Indices of arguments are literals, so that LLVM can inline all of this.
 
 
 @inlined
@@ -364,8 +364,8 @@ def _adam(frame):
     return 0
 
 
-# What takes longest and is waited for first comes first: who has a core to spare compiles in this
-# order (`native.ahead`).
+# The slowest and first needed come first: with a spare core they are compiled in this order
+# (`native.ahead`).
 HANDLERS = {
     "sums": _sums,
     "map_mark": _map_mark,
@@ -383,11 +383,11 @@ HANDLERS = {
 }
 
 RARE = ("squares", "tallies")
-"""Only policies of other papers need these: they are not compiled ahead."""
+"""Kernels of other papers' policies, which are not compiled ahead."""
 
 
 def register(name: str) -> str:
-    """Compiles a kernel (or takes it from the disk) and tells XLA of it, once; gives its target."""
+    """Compiles a kernel (or loads it) and registers it with XLA, once; returns its target."""
     target = f"r3jax_{name}"
     register_handlers({target: HANDLERS[name]})
     return target

@@ -1,4 +1,4 @@
-"""Kernels as functions of arrays, under the names of their formulas; XLA calls the machine code.
+"""Kernels as functions of arrays, named after their formulas; XLA calls the machine code.
 
 Arguments are named structs. Here their fields are arrays of JAX; in the kernels they are arrays and
 numbers of Numba, which `kernels.bridge` reads out of a call in the order of the fields.
@@ -22,7 +22,7 @@ from r3jax.kernels.splatting import records
 
 
 class MapRows(NamedTuple):
-    """What R depends on, row by row of a map."""
+    """The arrays that R depends on, by row of a map."""
 
     key: UInt32[Array, "2 N"]
     """Packed voxel index."""
@@ -31,16 +31,16 @@ class MapRows(NamedTuple):
     """Direction bins, 32 in a word."""
 
     counts: Float[Array, " N"]
-    """Observations; 0 where there is no voxel."""
+    """Number of observations; 0 for rows without a voxel."""
 
     m2: Float[Array, " N"]
-    """Spread of the colors."""
+    """Squared deviations of the colors."""
 
     resolution: Float[Array, " N"]
     """Best resolution [px/m]."""
 
     voxel_size: Float[Array, ""]
-    """Edge of a voxel [m]."""
+    """Voxel size [m]."""
 
 
 class Cells(NamedTuple):
@@ -65,7 +65,7 @@ class Cells(NamedTuple):
 
 
 class Views(NamedTuple):
-    """Views of one kind and one size, of their depth buffers' pixels."""
+    """Views of one kind and one size of depth buffer."""
 
     position: Float[Array, "P 3"]
     """Camera centers [m]."""
@@ -81,7 +81,7 @@ class Views(NamedTuple):
     cy: Float[Array, " P"]
 
     max_range: Float[Array, " P"]
-    """Nothing farther is visible [m]."""
+    """Range of visibility [m]."""
 
     tolerance: Float[Array, " P"]
     """Depth of the surface in the buffer, across itself [voxels]."""
@@ -94,7 +94,7 @@ class Views(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """What all views of a call have in common."""
+    """Properties that all views of a call share."""
 
     wraps: bool
     """True for octahedral maps of all directions."""
@@ -142,7 +142,7 @@ class FrameArrays(NamedTuple):
     """Focal length of resolutions [px]."""
 
     max_range: Float[Array, ""]
-    """Nothing farther counts [m]."""
+    """Range of the sensor [m]."""
 
     drops_edges: Float[Array, ""]
     """Above 0: pixels on depth edges are left out."""
@@ -184,7 +184,7 @@ class Images(NamedTuple):
 
 
 class Drawn(NamedTuple):
-    """What compositing keeps for its gradient: projected Gaussians, and the lists of the tiles."""
+    """Data of compositing for its gradient: projected Gaussians, and the lists of the tiles."""
 
     records: Float[Array, "n 16"]
     """See `kernels.splatting.records`."""
@@ -214,7 +214,7 @@ def map_add(
     rounding.
 
     Returns:
-        The rows and their mean colors, and how many voxels found no row.
+        The rows and their mean colors, and the number of dropped voxels.
     """
     *changing, voxel_size = rows
     table = [*changing, mean]
@@ -240,7 +240,8 @@ def map_mark(
     Args:
         rows: of the map.
         frame: the frame.
-        is_visible: 1 where no other voxel hides a row, which is shown then even where depth failed.
+        is_visible: 1 for rows that no other voxel hides, which count as seen even where depth
+            failed.
         num_bins: direction bins of a voxel.
     """
     marks = [rows.visited, rows.resolution]
@@ -257,14 +258,14 @@ def map_mark(
 def map_miss(
     rows: MapRows, mean: Float[Array, "3 N"], misses: UInt8[Array, " N"], frame: FrameArrays
 ) -> tuple[MapRows, Float[Array, "3 N"], UInt8[Array, " N"]]:
-    """Counts looks through each voxel and removes those that were looked through, in place.
+    """Counts frames that see through each voxel, and removes voxels with enough of them, in place.
 
     The formula is `mapping.moved.count_misses`.
 
     Args:
         rows: of the map.
         mean: colors of the rows.
-        misses: looks through each row so far.
+        misses: number of frames that saw through each row so far.
         frame: the frame.
     """
     changing = [rows.counts, rows.m2, mean, misses]
@@ -292,7 +293,7 @@ def sums(
         forms: of R.
         num_bins: bins of the panorama; 1 sums over all directions.
         voxel_bins: direction bins of a voxel.
-        keep: whether to say what each view sees.
+        keep: also return visibility.
 
     Returns:
         Sums of 1 - R [P, B] and numbers of unexplored cells [P, B]. If `keep`: also which rows
@@ -322,7 +323,7 @@ def changes(
     Args:
         before: rows of the map before the views.
         after: the same rows after them.
-        cells: of the grid; `unexplored` says which are no longer so after the views.
+        cells: of the grid; `unexplored` marks cells that are no longer unexplored after the views.
         seen: bits of the rows and cells that each position sees.
         position: camera centers [m].
         focal: focal lengths of R [px].
@@ -369,7 +370,7 @@ def terms(
     """Computes the terms of R of every row, hidden or not: `scoring.terms.score_voxels`.
 
     Returns:
-        kappa, bias, delta, noise, resolution and R; all NaN where a position is not finite.
+        kappa, bias, delta, noise, resolution and R; all NaN if a position is not finite.
     """
     # An array for each term: none is copied out of one for all.
     term = jax.ShapeDtypeStruct((position.shape[0], rows.counts.shape[0]), jnp.float32)
@@ -471,14 +472,14 @@ def adam(
         rates: of means, quats, log scales, logits, the constant harmonic and the others.
         corrections: factors of the moments.
         num_open: harmonics that take part.
-        is_wanted: if not, or if a number or a gradient is not finite, nothing changes.
+        is_wanted: if False, or if a number or a gradient is not finite, nothing changes.
 
     Returns:
         The state after, and whether the step was done.
     """
     row = 3 * state[4].shape[1]
     options = [jnp.int32(x) for x in (row, 3 * num_open, is_wanted, _workers()[0])]
-    # Not flat: XLA would copy what it has to view as another shape.
+    # Not flattened: XLA would copy arrays to reshape them.
     shapes = [*map(_like, state), jax.ShapeDtypeStruct((1,), jnp.int32)]
     *after, applied = _call(
         "adam",
@@ -491,7 +492,7 @@ def adam(
 
 
 def _call(name: str, results: list[jax.ShapeDtypeStruct], arguments: Any, **options: Any) -> Any:
-    """Calls a kernel, which is compiled (or read from the disk) when the first call is traced."""
+    """Calls a kernel, which is compiled (or loaded from disk) when its first call is traced."""
     from r3jax.kernels.bridge import register
 
     return tuple(jax.ffi.ffi_call(register(name), results, **options)(*jax.tree.leaves(arguments)))

@@ -1,4 +1,4 @@
-"""Numbers that the formulas in plain JAX share with the kernels."""
+"""Constants shared by the formulas in plain JAX and the kernels."""
 
 import numpy as np
 
@@ -6,10 +6,10 @@ ON_EDGE = 1e-6
 """Tangent coordinates within this of 0 lie on the edge of kappa's box, which belongs to it."""
 
 CORNER = 0.6
-"""Where visibility is tested, in edges from a voxel's center along columns and rows."""
+"""Points at which visibility is tested, in voxels from a voxel's center along columns and rows."""
 
 HALF_WIDTH = 0.51
-"""Half an edge, and a little for rounding: how far a voxel's footprint reaches from its center."""
+"""Half the size of a voxel's footprint, in voxels, with a tolerance for rounding."""
 
 NEAR = 0.25
 """The projection is linear in the position only nearly: added edges per edge / distance."""
@@ -28,7 +28,7 @@ MAX_STRETCH = 6.0
 normal."""
 
 FAR = 1e4
-"""Stands for "nothing there", so that differences stay finite [m]."""
+"""Replaces infinite depth, so that differences stay finite [m]."""
 
 STRAY = 0.01
 """Share of the depth by which a pixel may stray from the median around it: two or three sigma of
@@ -38,17 +38,18 @@ THIN = 0.06
 """Share of the depth that noise of 1 % never explains: steps beyond it are edges of thin parts."""
 
 JOINED = 1 << 13
-"""Voxels that join the map at once. A frame rarely touches more; one that does takes turns."""
+"""Chunk size of voxels that join the map. Frames rarely touch more; then they take several
+chunks."""
 
 MAX_PROBES = 192
-"""A key that finds no place within this many probes counts as dropped: at a load of 0.7 the
-expected longest search is about 30."""
+"""Maximum number of probes before a key is dropped; at a load of 0.7 the expected longest search is
+about 30."""
 
 TILE = 16
 """Edge of a tile [px]."""
 
 NEAR_PLANE = 0.01
-"""Gaussians whose center is nearer than this are not drawn [m]."""
+"""Near plane: Gaussians with nearer centers are not drawn [m]."""
 
 DILATION = 0.3
 """Added to the diagonal of every projected covariance [px^2], so that nothing is thinner than a
@@ -105,17 +106,17 @@ HALF_DIAGONAL = 0.867
 """Half the diagonal of a voxel, in edges: its footprint in an image is within this."""
 
 MOST_HALF = 31
-"""Largest half footprint [px]: what fills more of an image is too close to be judged."""
+"""Largest half footprint [px]; voxels with larger ones are too close for a conclusion."""
 
 LEAST_FOOTPRINT = 1.5
-"""Smallest edge of a voxel in an image [px]; what is smaller is too far to be judged."""
+"""Smallest size of a voxel in an image [px]; smaller ones are too far away for a conclusion."""
 
 NEAR_ENOUGH = 1.0 / 3.0
-"""A look counts against a voxel if its resolution is at least this share of the best one: a thin
-thing that was measured from near by is not removed from afar, where pixels miss it."""
+"""A frame counts against a voxel if its resolution is at least this share of the best one: thin
+objects measured from nearby are not removed by distant frames, whose pixels miss them."""
 
 FEW_OBSERVATIONS = 2
-"""Voxels with at most this number of observations are doubted sooner."""
+"""Voxels with at most this number of observations are removed sooner."""
 
 MISSES_OF_FEW = 2
 """Looks through a voxel of few observations, without a confirmation between, that remove it."""

@@ -1,1 +1,1 @@
-"""A frame joins a map, in machine code."""
+"""Integration of frames into a map, in machine code."""

@@ -1,4 +1,4 @@
-"""The direction bin and the resolution of a look at a voxel."""
+"""Direction bins and resolutions of voxels seen from a camera."""
 
 # Kernels have the types that Numba infers where they are called; annotations it would not read.
 # pyright: reportMissingParameterType=false, reportUnknownParameterType=false
@@ -15,14 +15,14 @@ _X, _Y, _Z, _SHARPNESS = 0, 1, 2, 3
 """Rows of a chunk's looks: direction and resolution [px/m]."""
 
 _CHUNK = 256
-"""Voxels whose looks are worked out together, in vectors, and stay in the L1 cache."""
+"""Number of voxels processed together, in vectors that stay in the L1 cache."""
 
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _LEAST, _TINY, _INFINITE = np.float32(1e-6), np.float32(1e-20), np.float32(np.inf)
 
 
 class Camera(NamedTuple):
-    """Where voxels are seen from, and how sharply."""
+    """Position and focal length of the camera."""
 
     voxel_size: Any
     """[m]."""
@@ -147,6 +147,6 @@ def mark_rows(key, visited, resolution, rows, num, camera, table, lattice):
 
 @inlined
 def is_valid(camera):
-    """Checks a camera and a voxel size: nothing is seen with invalid ones."""
+    """Checks if a camera and a voxel size are valid; otherwise nothing is seen."""
     total = camera.voxel_size + camera.focal + camera.x + camera.y + camera.z
     return (camera.voxel_size > _ZERO) & (abs(total) < _INFINITE)

@@ -1,4 +1,4 @@
-"""Which voxels a frame shows, and their direction bins: `mapping.seen` in machine code."""
+"""Finds visible voxels and their direction bins: `mapping.seen` in machine code."""
 
 # Kernels have the types that Numba infers where they are called; annotations it would not read.
 # pyright: reportMissingParameterType=false, reportUnknownParameterType=false
@@ -21,7 +21,7 @@ from r3jax.kernels.native.compiled import (
 )
 
 BLOCK = 1 << 12
-"""Rows that a worker looks at before it takes the next."""
+"""Number of rows that a worker takes at a time."""
 
 _AHEAD = 16
 """Prefetch distance [rows]: their pixels lie anywhere in memory."""

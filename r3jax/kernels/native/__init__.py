@@ -1,1 +1,1 @@
-"""Machine code: how kernels are compiled with Numba, and how XLA calls them."""
+"""Machine code: compiles kernels with Numba, and lets XLA call them."""

@@ -1,8 +1,8 @@
-"""Compiles the kernels for CPUs in a process of its own, while the first planner begins.
+"""Compiles the CPU kernels in a separate process while the first planner starts.
 
-Numba holds Python's lock while it compiles, over a minute of one core for all kernels. With
-a spare core the main process finds them in the cache, or waits only for the one that it needs
-(`ffi.register_handlers`). Afterwards the disk has them, and nothing is started.
+Numba holds Python's lock while it compiles, over a minute of one core for all kernels. With a spare
+core the main process finds them in the cache, or waits only for the one that it needs
+(`ffi.register_handlers`). Afterwards they are on disk, and no process is started.
 """
 
 import contextlib
@@ -29,7 +29,7 @@ def cache_folder() -> Path:
 
 @functools.cache
 def compile_ahead(cache: Path | None = None) -> None:
-    """Starts the process, unless it came to its end once with these sources on this machine.
+    """Starts the process, unless it has finished before with these sources on this machine.
 
     Args:
         cache: folder for the note that it did; None: in the package's own.
@@ -41,11 +41,11 @@ def compile_ahead(cache: Path | None = None) -> None:
     is_python = Path(sys.executable or "").name.startswith("python")
     if note.exists() or not is_python:
         return
-    # What cannot be started is compiled where it is needed.
+    # If it cannot be started, kernels are compiled when needed.
     with contextlib.suppress(OSError):
         subprocess.Popen(
             [sys.executable, "-m", COMPILER, str(note)],
-            # Kernels are for CPUs: a GPU's memory is that of who starts this.
+            # Kernels are for CPUs: leave the GPU's memory to the main process.
             env={**os.environ, "JAX_PLATFORMS": "cpu"},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,

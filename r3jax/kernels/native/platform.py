@@ -1,4 +1,4 @@
-"""Kernels on CPUs, plain JAX elsewhere: the choice that is made where a program is lowered."""
+"""Chooses kernels on CPUs and plain JAX elsewhere when a program is lowered."""
 
 import functools
 import os
@@ -24,7 +24,7 @@ def by_platform(*, cpu: Callable[..., Any], default: Callable[..., Any]) -> Call
     """
     if not can_call_kernels():
         return default
-    # Both would be traced, which takes a fifth of a short run, for one that cannot be used.
+    # Both would be traced, which takes a fifth of a short run, although one cannot be used.
     if is_cpu_only():
         return cpu
     return functools.partial(jax.lax.platform_dependent, cpu=cpu, default=default)
@@ -123,7 +123,7 @@ def can_call_kernels() -> bool:
 
 
 def missing_for_kernels() -> str:
-    """Says why XLA can call no kernel here; empty: it can."""
+    """Explains why XLA cannot call kernels here; empty if it can."""
     if problem := misread():
         has = "jaxlib 0.10 to 0.12 have them where they are read"
         return f"the structs of jaxlib {version('jaxlib')} cannot be read: {problem} ({has})"
@@ -131,12 +131,12 @@ def missing_for_kernels() -> str:
 
 
 def missing_for_machine_code() -> str:
-    """Says why Numba compiles nothing here; empty: it does."""
+    """Explains why Numba cannot compile here; empty if it can."""
     return _start()[1]
 
 
 def describe_kernels() -> str:
-    """Says how this machine maps, scores and trains on its CPU."""
+    """Describes how this machine maps, scores and trains on its CPU."""
     if problem := missing_for_kernels():
         return f"plain JAX, since {problem}"
     return f"machine code on {num_cores()} cores, Numba's threading layer {_start()[0]}"
@@ -170,7 +170,7 @@ def compiled_or_plain(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def num_cores() -> int:
-    """Cores that this process may use, which a scheduler may keep below those of the machine."""
-    if hasattr(os, "sched_getaffinity"):  # not on macOS, which ties no process to cores
+    """Number of cores that this process may use, possibly limited by a scheduler."""
+    if hasattr(os, "sched_getaffinity"):  # not on macOS, which has no CPU affinity
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
