@@ -53,6 +53,9 @@ def parse(commands: Mapping[str, type], words: Sequence[str], description: str) 
         InputError: a value that an option's dataclass refuses.
     """
     is_list = not words or words[0] not in commands
+    for option, where in getattr(commands.get(words[0] if words else ""), "RETIRED", {}).items():
+        if any(word.partition("=")[0] == option for word in words):
+            raise InputError(f"{option} has left `r3jax {words[0]}`: {where}")
     kinds: list[Any] = []
     for name, kind in commands.items():
         text = inspect.cleandoc(kind.__doc__ or "")

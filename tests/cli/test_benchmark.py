@@ -157,6 +157,7 @@ def test_a_cell_that_fails_is_named_and_the_exit_code_says_so(room, tmp_path, ca
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"photos": "captures/lounge"}, "r3jax select"),
         ({"scenes": "castle"}, "'castle'"),
         ({"scenes": ""}, "no scenes"),
         ({"policies": "oracle"}, "'oracle'"),

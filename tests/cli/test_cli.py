@@ -10,7 +10,7 @@ import trimesh
 
 from r3jax.cli.command_line import COMMANDS, find_command
 from r3jax.cli.main import main
-from r3jax.cli.options.benchmark import PhotoOptions, SubmissionOptions
+from r3jax.cli.options.benchmark import SubmissionOptions
 from r3jax.cli.parsing import parse
 from r3jax.exploration.config import parse_budget
 from r3jax.runs.reader import read_run
@@ -208,7 +208,6 @@ def test_help_begins_with_examples_that_parse_and_shows_no_default_of_none(
     monkeypatch.setattr(COMMANDS[name], "__post_init__", lambda self: None, raising=False)
     monkeypatch.setattr("r3jax.cli.options.explore.check_run", lambda path: None)
     monkeypatch.setattr(SubmissionOptions, "__post_init__", lambda self: None)
-    monkeypatch.setattr(PhotoOptions, "__post_init__", lambda self: None)
     for program, *words in examples:
         assert (program, words[0]) == ("r3jax", name)
         assert isinstance(parse(COMMANDS, words, ""), COMMANDS[name])

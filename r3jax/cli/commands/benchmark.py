@@ -34,7 +34,6 @@ from r3jax.apps.benchmark.tables import (
     reference_in,
     without_empty_columns,
 )
-from r3jax.cli.commands.benchmark_photos import run_photos_of
 from r3jax.cli.console import (
     Bar,
     BarColumn,
@@ -80,8 +79,6 @@ def run_benchmark(options: BenchmarkOptions) -> int:
         return _check_submissions(console, options)
     if options.results.site is not None:
         return _write_site(console, options)
-    if options.pool.photos:
-        return run_photos_of(console, options)
     if options.machines.jobs > 0 and visible_gpus():
         # The workers have the GPUs; planning must not hold on to their memory.
         jax.config.update("jax_platforms", "cpu")

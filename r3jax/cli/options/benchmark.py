@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from tyro.conf import UseAppendAction, arg
 
@@ -18,19 +18,13 @@ from r3jax.cli.options.groups import (
 )
 from r3jax.errors import InputError
 from r3jax.exploration.config import parse_budget
-from r3jax.formats.errors import check_capture
 
 _WITH_SUBMISSION = (
     "submission", "check", "scenes", "snapshots", "out", "train_resolution", "iterations",
     "gaussians", "capacity", "test_views", "lpips", "backend", "engine", "jobs", "slurm",
     "format", "reference",
 )  # fmt: skip
-_WITH_PHOTOS = (
-    "photos", "choose", "first", "nearest", "every", "policies", "seeds", "out", "up",
-    "max_range", "voxel_size", "train_resolution", "iterations", "gaussians", "capacity", "lpips",
-    "backend",
-)  # fmt: skip
-"""Options that make sense beside these."""
+"""Options that make sense beside it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,33 +131,6 @@ class OutputOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PhotoOptions:
-    """Choice among the photos of a capture (COVER's protocol)."""
-
-    photos: Annotated[tuple[Path, ...], arg(metavar="PATH")] = ()
-    """Choose among the photos of captures with depth, while a model trains on the chosen ones;
-    every eighth photo is a test view. Recordings are y-up unless --up is given. Default policies:
-    r3,cover,gavis,random. --iterations counts from the last photo."""
-
-    choose: int = 20
-    """Photos to choose."""
-
-    first: int = 10
-    """Initial photos, drawn at random by the seed and the same for all policies."""
-
-    nearest: int = 5
-    """Candidates of each choice: this number of photos nearest to the last one."""
-
-    every: int = 200
-    """Training steps between two choices."""
-
-    def __post_init__(self) -> None:
-        """Refuses a path that is not a capture."""
-        for path in self.photos:
-            check_capture(path)
-
-
-@dataclass(frozen=True, kw_only=True)
 class BenchmarkOptions:
     """Compare policies on equal terms: explore, train and evaluate scenes x policies x seeds.
 
@@ -172,7 +139,6 @@ class BenchmarkOptions:
         r3jax benchmark --budget views:60 --snapshots views:30,views:60 --jobs 2
         r3jax benchmark --policies r3-pano --sweep lambda2=0.2,0.5,0.8 --format latex
         r3jax benchmark --submission theirs.jsonl --check
-        r3jax benchmark --photos captures/lounge --choose 12 --seeds 0,1,2
     """
 
     scenes: Annotated[str, arg(metavar="A,B")] = "flat,office"
@@ -203,7 +169,11 @@ class BenchmarkOptions:
     machines: MachineOptions = field(default_factory=MachineOptions)
     submissions: SubmissionOptions = field(default_factory=SubmissionOptions)
     results: OutputOptions = field(default_factory=OutputOptions)
-    pool: Annotated[PhotoOptions, arg(name="photos")] = field(default_factory=PhotoOptions)
+
+    RETIRED: ClassVar[dict[str, str]] = {
+        "--photos": "use `r3jax select CAPTURE --frames N`; COVER's protocol is in commit 042e0d34",
+    }
+    """Options that have left, and what takes their place."""
 
     @property
     def seed_numbers(self) -> tuple[int, ...]:
@@ -240,8 +210,6 @@ class BenchmarkOptions:
             refuse_others(self, "--submission", "submission", _WITH_SUBMISSION)
             if self.scenes != BenchmarkOptions.scenes and not self.scenes.startswith("mesh:"):
                 raise InputError("--scenes locates the mesh of a submission: mesh:<file>")
-        if self.pool.photos:
-            refuse_others(self, "--photos", "captures", _WITH_PHOTOS)
         for scene in words(self.scenes):
             check_scene(scene, self.meshes.scale)
         for policy in words(self.policies):
