@@ -137,37 +137,6 @@ def test_where_a_climb_ends_is_checked(seed, motion):
         law_safe(where, candidates(where, seed, poor=True))
 
 
-@pytest.mark.full
-def test_climbing_gains_and_compiles_once():
-    """Random directions leave much to gain: half of the best of these, a tenth or more."""
-    where, gains = situation_of(MOTIONS["free"]), []
-    for seed in range(4):
-        poses = candidates(where, seed)
-        before = utility_of(where, poses)
-        _, found = refine.refine_best(where, poses, {"utility": before}, CONFIG)
-        total = net_utility(before, paths_of(where, poses), CONFIG.lambda2)
-        best = np.argsort(-total)[:REFINED]
-        gains += list(found["utility"][best] / before[best] - 1.0)
-    assert np.median(gains) > 0.1
-    num = refine._climb._cache_size()
-    for seed, motion in enumerate(MOTIONS.values()):
-        where = situation_of(motion)
-        poses = candidates(where, seed)
-        refine.refine_best(where, poses, {"utility": utility_of(where, poses)}, CONFIG)
-    assert refine._climb._cache_size() == num
-
-
-@pytest.mark.full
-def test_turning_alone_gains_and_stays():
-    where = situation_of(MOTIONS["free"])
-    config = dataclasses.replace(CONFIG, refine_radius=0.0)
-    poses = candidates(where, 1)
-    before = utility_of(where, poses)
-    after, found = refine.refine_best(where, poses, {"utility": before}, config)
-    np.testing.assert_array_equal(after.position, poses.position)
-    assert (found["utility"] / before).max() > 1.05
-
-
 def badly_seen() -> tuple[r3jax.MapState, OccupancyGrid]:
     """A wall seen well from in front; a patch of it only along the wall. Nothing is unexplored."""
     state = wall()
