@@ -14,7 +14,7 @@ import re
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -436,63 +436,3 @@ def npy(array: np.ndarray) -> bytes:
     file = io.BytesIO()
     np.lib.format.write_array(file, array, allow_pickle=True)
     return file.getvalue()
-
-
-def bombs_of(files: Files) -> Iterator[Files]:
-    """The tree with one file after the other replaced."""
-    kinds: set[str] = set()
-    for name, data in files.items():
-        kind = name.rpartition(".")[2]
-        if isinstance(data, bytes) and kind not in kinds:
-            kinds.add(kind)  # one image stands for all
-            for bomb in BOMBS.get(kind, lambda data: [])(data):
-                yield files | {name: bomb}
-
-
-def texts(data: bytes) -> list[bytes]:
-    """Lines, columns and digits without end."""
-    head = data[: data.find(b"\n") + 1]
-    return [head + b"\n" * 2_000_000, head + b"0 " * 1_000_000, b"9" * 2_000_000]
-
-
-def trees(data: bytes) -> list[bytes]:
-    """Nesting, lists and numbers without end, alone and where numbers are expected."""
-    long = [b"[" * 2_000_000, b"[" + b"[]," * 500_000 + b"[]]", b"1" * 2_000_000, b"1e9999999"]
-    if data[:1] == b"{":
-        first, *rest = data.split(b"\n") if data.startswith(b"{", data.find(b"\n") + 1) else [data]
-        plain = json.loads(first)
-        large = [plain | {name: [[0.0]] * 50_000} for name in plain]
-        long += [b"\n".join([json.dumps(tree).encode(), *rest]) for tree in large]
-    return long
-
-
-def counted(data: bytes) -> list[bytes]:
-    """Counts of nearly everything at every place of a COLMAP file's beginning."""
-    return [
-        data[:at] + struct.pack("<Q", count) + data[at + 8 :]
-        for at in range(0, min(len(data), 96), 4)
-        for count in (1 << 26, 1 << 60)
-    ]
-
-
-def ply_heads(data: bytes) -> list[bytes]:
-    """Promises many vertices, and lists that are longer than the file."""
-    end = data.find(b"end_header")
-    head, rest = data[:end].splitlines(), data[end:]
-    many = [
-        b" ".join([*line.split()[:2], b"3000000000"]) if line.startswith(b"element") else line
-        for line in head
-    ]
-    return [b"\n".join([*many, rest]), data + bytes(2_000_000)]
-
-
-BOMBS: dict[str, Callable[[bytes], list[bytes]]] = {
-    "png": lambda data: [png_bomb()],
-    "jpg": lambda data: [png_bomb()],
-    "npz": lambda data: [zip_bomb()],
-    "json": trees,
-    "jsonl": trees,
-    "txt": texts,
-    "bin": counted,
-    "ply": ply_heads,
-}

@@ -1,4 +1,4 @@
-"""The command line with odd words, on whole and on damaged folders.
+"""The command line with hostile values, and on damaged folders.
 
 The work itself (exploring, mapping, training, evaluating, planning a benchmark) is left out: a case
 ends where it would begin. What was asked is refused with one line and exit code 2, or makes sense.
@@ -28,7 +28,7 @@ from r3jax.mapping.join import merge
 from r3jax.runs.header import header_to_json
 from r3jax.simulators.meshes import load_world
 from r3jax.simulators.raycast.raycast import RaycastSimulator
-from tests.fuzz.mutations import NUMBER_TEXTS, mutate
+from tests.fuzz.mutations import mutate
 from tests.fuzz.tree import Entry, Files
 from tests.runs.runs import make_header
 from tests.simulators.rooms import box_quads, world_of
@@ -75,17 +75,6 @@ def options_of(command: str) -> list[str]:
 OPTIONS = {name: options_of(name) for name in sorted({words[0] for words in COMMANDS})}
 """The options of each command."""
 
-WORDS = (
-    *(number.decode() for number in NUMBER_TEXTS),
-    "views:nan", "views:1e308", "views:-1", "views:", ":", "seconds:inf", "metres:0", "views:1.5",
-    "every:0", "every:-3", "every:1e9", "mesh:", "mesh:../outside/secret", "mesh:/dev/zero",
-    "mesh:.", "mesh:run/run.json", "mesh:x\0.glb", "../../x", "/proc/nope", "/dev/null/x", ".",
-    "run", "recording", "run/run.json", "a,b,,c", "lambda2=nan", "lambda2=[[1]]", "=", "x=",
-    "scoring.lambda1={}", "num_candidates=1e308", "\udcff", "x" * 5000, "x\0y", "~", "-", "--",
-    "[bold]", "{}", "%s", "\n", " ",
-)  # fmt: skip
-
-
 CONFIG = ExplorationConfig()
 
 
@@ -127,28 +116,11 @@ def seeds(run: Files, splats: Files, recording: Files) -> list[Files]:
 
 
 def make(rng: np.random.Generator, files: Files) -> tuple[Files, str]:
-    """Odd words, or a damaged folder, or both."""
-    words = json.loads(bytes_of(files["words.json"]))
-    known = [*OPTIONS[words[0]], "--nonsense"]
-    changed, what = dict(files), "whole files"
-    if rng.random() < 0.4:
-        folder = ("run/", "recording/")[rng.integers(2)]
-        part, what = mutate(rng, {k: v for k, v in files.items() if k.startswith(folder)})
-        changed = {k: v for k, v in files.items() if not k.startswith(folder)} | dict(part)
-    for _ in range(int(rng.integers(0 if what != "whole files" else 1, 3))):
-        word = WORDS[rng.integers(len(WORDS))]
-        how = rng.integers(8)
-        if how == 0:
-            words.insert(int(rng.integers(len(words) + 1)), word)
-        elif how <= 2:
-            words[int(rng.integers(len(words)))] = word
-        else:
-            words += [known[rng.integers(len(known))], word]
-    for i in range(1, len(words)):
-        if words[i - 1] in ("--out", "--plot") and words[i] == "../../x":
-            words[i] = "deep/x"  # who asks for a folder gets it
-    changed["words.json"] = json.dumps(words).encode()
-    return changed, f"{what}, {words!r:.300}"
+    """A damaged run or recording."""
+    folder = ("run/", "recording/")[rng.integers(2)]
+    part, what = mutate(rng, {k: v for k, v in files.items() if k.startswith(folder)})
+    whole = {k: v for k, v in files.items() if not k.startswith(folder)}
+    return whole | dict(part), f"{what}, {bytes_of(files['words.json'])!r:.300}"
 
 
 def bytes_of(entry: Entry) -> bytes:

@@ -1,4 +1,4 @@
-"""The closed forms against independent golden values, and the laws that they obey."""
+"""The laws that the closed forms obey."""
 
 import jax
 import jax.numpy as jnp
@@ -44,16 +44,6 @@ def terms(directions, distances, colors, count, query_direction, query_distance)
         return jax.tree.map(lambda term: term[jnp.minimum(row, CAPACITY - 1)], found)
 
     return jax.vmap(one)(directions, distances, colors, count, query_direction, query_distance)
-
-
-def test_every_term_agrees_with_the_golden_values(shared):
-    golden = np.load(shared("golden", "renderability_terms.npz"))
-    names = ("observed_direction", "observed_distance", "observed_rgb", "n")
-    inputs = [jnp.asarray(golden[name]) for name in (*names, "query_direction", "query_distance")]
-    ours = terms(*inputs)
-    for name in TERMS:
-        expected = golden["renderability" if name == "value" else name]
-        np.testing.assert_allclose(getattr(ours, name), expected, atol=1e-4, err_msg=name)
 
 
 def _random_cases(seed: int, num: int = 16):
