@@ -1,7 +1,7 @@
 """Plans of the paths of robots, before and after they had a footprint, and the table of them all.
 
-python -m experiments.robots --settings before --out experiments/results/robots.jsonl
-python -m experiments.robots --out experiments/results/robots.jsonl
+python -m experiments.robots --settings before --out experiments/results/robots/drives.jsonl
+python -m experiments.robots --out experiments/results/robots/drives.jsonl
 python -m docs.figures.robots
 """
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from experiments.robots import PIXEL, Robot, plan_of, scene_world
 
-RESULTS = Path("experiments/results/robots.jsonl")
+RESULTS = Path("experiments/results/robots/drives.jsonl")
 IMAGE = Path("docs/images/robots.png")
 SHOWN = ({"height": 0.3}, {"height": 0.9, "tilt": -20.0})
 
@@ -78,11 +78,17 @@ def main() -> None:
             for which, color in (("after", "#1f77b4"), ("before", "#d62728")):
                 for row in (r for r in mine if r["settings"] == which):
                     track = np.array(row["track"])
-                    axis.plot(track[:, 0], track[:, 1], color=color, lw=1.2, label=which)
+                    axis.plot(track[:, 0], track[:, 1], color=color, lw=0.9, label=which)
+                    if row["views"]:
+                        views = np.array(row["views"])
+                        axis.plot(views[:, 0], views[:, 1], "o", color=color, ms=2.5)
             axis.set_title(f"{scene}: camera at {robot.height:g} m, {robot.tilt:+.0f}°", fontsize=9)
             axis.set_xticks([]), axis.set_yticks([])
-    axes[0, 0].legend(loc="lower left", fontsize=8)
-    figure.tight_layout()
+    names = {"after": "with a footprint", "before": "ball of free cells"}
+    handles = {names[line.get_label()]: line for axis in axes.flat for line in axis.get_lines()
+               if line.get_label() in names}  # fmt: skip
+    figure.legend(handles.values(), handles.keys(), loc="lower center", ncols=2, fontsize=9)
+    figure.tight_layout(rect=(0.0, 0.04, 1.0, 1.0))
     figure.savefig(IMAGE, dpi=90)
     print(table(found))
 

@@ -380,8 +380,11 @@ def travel_of(
         return plan_travel(grid, position, config.safety_margin, trail, heights, body)
     if body.heights is None:
         return plan_travel(grid, position, body.needed, trail, heights)
-    present = np.asarray(map_state.present)
-    voxels = np.asarray(map_state.center)[:, present].T.astype(np.float64, order="C")
+    # Voxels above the body are left where they are: in a hall they are most of all.
+    center = np.asarray(map_state.center)
+    tallest = position[2] + (body.heights[1] or 0.0) + float(grid.cell_size)
+    near = np.asarray(map_state.present) & (center[2] < tallest)
+    voxels = center[:, near].T.astype(np.float64, order="C")
     size = float(map_state.voxel_size)
     stood = None if state.taken is None else state.taken[:, :2].astype(np.float64)
     room = room_for(body, grid, voxels, size, pose, state.camera, trail, stood)

@@ -514,28 +514,23 @@ def _floor_map(
     at = np.ravel_multi_index((cells[:, 0], cells[:, 1], level), (*shape[:2], num))
     filled = np.bincount(at, minlength=shape[0] * shape[1] * num).reshape(*shape[:2], num)
     heights = (low + np.arange(num) + 0.5) * voxel_size
-    floor = np.full(shape[:2], np.nan)
+    # A border of unknown columns: no column needs to be checked against the edges.
+    floor, known = np.zeros((shape[0] + 2, shape[1] + 2)), np.zeros((shape[0] + 2, shape[1] + 2))
     x, y = np.clip(_column(position, origin, size), 0, np.array(shape[:2]) - 1)
-    floor[x, y] = start
-    pad = lambda a, fill: np.pad(a, 1, constant_values=fill)
-    for _ in range(sum(shape[:2])):
-        is_known = ~np.isnan(floor)
-        if is_known.all():
-            break
-        values, weights = (
-            pad(np.where(is_known, floor, 0.0), 0.0),
-            pad(is_known, False).astype(float),
-        )
-        near = lambda a: a[:-2, 1:-1] + a[2:, 1:-1] + a[1:-1, :-2] + a[1:-1, 2:]
-        count = near(weights)
-        new = ~is_known & (count > 0)
+    floor[x + 1, y + 1], known[x + 1, y + 1] = start, 1.0
+    near = lambda a: a[:-2, 1:-1] + a[2:, 1:-1] + a[1:-1, :-2] + a[1:-1, 2:]
+    while True:
+        count = near(known)
+        new = (count > 0.0) & (known[1:-1, 1:-1] == 0.0)
         i, j = np.nonzero(new)
-        expected = near(values)[new] / count[new]
+        if not len(i):
+            return floor[1:-1, 1:-1]
+        expected = near(floor)[new] / count[new]
         weight = filled[i, j] * (np.abs(heights - expected[:, None]) <= 1.3 * voxel_size)
         total = weight.sum(axis=1)
         found = (weight * heights).sum(axis=1) / np.maximum(total, 1.0)
-        floor[i, j] = np.where(total > 0, found, expected)
-    return np.where(np.isnan(floor), start, floor)
+        floor[i + 1, j + 1] = np.where(total > 0, found, expected)
+        known[i + 1, j + 1] = 1.0
 
 
 def _highest_seen(
