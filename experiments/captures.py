@@ -45,11 +45,11 @@ from r3jax.apps.benchmark.record import read_records, write_records
 from r3jax.apps.benchmark.tables import metric_named
 from r3jax.evaluation.comparison import (
     check_equal_terms,
+    paired_difference,
     scores_by_method,
     snapshots_of,
     with_short_names,
 )
-from r3jax.evaluation.statistics import paired_difference
 from r3jax.exploration.config import ClockName
 from r3jax.runs.reader import read_run
 

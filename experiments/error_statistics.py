@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from r3jax.evaluation.statistics import LEVEL, RESAMPLES, Estimate
+from r3jax.evaluation.comparison import LEVEL, RESAMPLES, Estimate
 
 _NOTHING_LEFT = 1e-9
 """A variance below this share of the whole is rounding."""

@@ -25,9 +25,8 @@ from r3jax.mapping.state import empty_map
 from r3jax.mapping.update import integrate_growing
 from r3jax.splatting.scene import GaussianScene
 from r3jax.splatting.training.config import TrainConfig
-from r3jax.splatting.training.growth import Addition, Growth, where_new
 from r3jax.splatting.training.initialize import initialize
-from r3jax.splatting.training.train import fit
+from r3jax.splatting.training.train import Addition, Growth, fit, where_new
 from r3jax.splatting.views import Views, fitted_size
 
 EVERY = 50

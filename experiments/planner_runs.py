@@ -22,10 +22,9 @@ from typing import Any, Literal
 import jax
 
 from r3jax.apps.benchmark.record import machine, source_commit
-from r3jax.exploration.clock import WallClock
 from r3jax.exploration.config import ExplorationConfig, parse_budget
 from r3jax.exploration.guard import GuardedSimulator
-from r3jax.exploration.state import LoopState, Mission, Stop
+from r3jax.exploration.state import LoopState, Mission, Stop, WallClock
 from r3jax.exploration.step import start_state, step
 from r3jax.exploration.taken_views import TakenView
 from r3jax.files import write_atomic

@@ -40,14 +40,15 @@ from r3jax.apps.benchmark.reference_images import read_reference_images, referen
 from r3jax.apps.benchmark.tables import notes
 from r3jax.apps.forecast.forecast import view_features
 from r3jax.evaluation.comparison import (
+    RESAMPLES,
+    Estimate,
     check_equal_terms,
     method_name,
     scenes_of,
     view_values,
     with_short_names,
 )
-from r3jax.evaluation.maps import map_of
-from r3jax.evaluation.statistics import RESAMPLES, Estimate
+from r3jax.evaluation.judge import map_of
 from r3jax.plots import style
 from r3jax.runs.reader import read_run
 from r3jax.scoring.config import ScoringConfig

@@ -38,13 +38,13 @@ from r3jax.captures.source import Source, source_of
 from r3jax.captures.surfaces import with_surfaces
 from r3jax.captures.survey import Survey, survey_of
 from r3jax.errors import InputError
+from r3jax.evaluation.comparison import Estimate, mean_over_scenes, paired_difference
 from r3jax.evaluation.evaluate import ImageMetric, evaluate
 from r3jax.evaluation.image_metrics import load_lpips
-from r3jax.evaluation.statistics import Estimate, mean_over_scenes, paired_difference
 from r3jax.files import append_line, make_folder
 from r3jax.formats.captures import open_capture
 from r3jax.planning.candidates import spread
-from r3jax.splatting.config import RasterConfig, fitting_budget
+from r3jax.splatting.backend import RasterConfig
 from r3jax.splatting.scene import GaussianScene
 from r3jax.splatting.training.config import TrainConfig
 from r3jax.splatting.training.initialize import initialize
@@ -305,7 +305,7 @@ def trained(views: Views, cell: Cell, gaussians: int) -> GaussianScene:
     """Trains on some frames; each is shown as often as any other, or once more a round."""
     config = TrainConfig(
         iterations=cell.iterations, num_gaussians=gaussians, seed=cell.seed,
-        raster=RasterConfig(max_intersections=fitting_budget(_PAIRS * gaussians)),
+        raster=RasterConfig().with_room(_PAIRS * gaussians),
     )  # fmt: skip
     key = jax.random.key(cell.seed)
     scene = initialize(views, gaussians, config.rows, config.sh_degree, key=key)

@@ -47,7 +47,7 @@ from .scoring.renderability import (
 from .scoring.soft_utility import SoftUtility, soft_utility
 from .scoring.utility import ViewUtility, view_utility
 from .simulators.scenes.registry import open_scene
-from .splatting.config import RasterConfig
+from .splatting.backend import RasterConfig
 from .splatting.ply import read_scene, write_scene
 from .splatting.render import Rendering, render
 from .splatting.scene import GaussianScene

@@ -20,7 +20,7 @@ from PIL import Image
 import r3jax
 from docs.figures.stills import Sheet, Squares, compose, draw, lines, overview
 from r3jax.apps.viewer.blocks import block_colors, cut_height, known_at, scoring_of
-from r3jax.apps.viewer.overlays import frustum_segments, path_segments
+from r3jax.apps.viewer.pictures import frustum_segments, path_segments
 from r3jax.apps.viewer.story import Timeline
 from r3jax.runs.reader import Run, read_run
 

@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from r3jax.apps.viewer.blocks import title_of
-from r3jax.apps.viewer.color_maps import SCORES, UNSEEN, paint
+from r3jax.apps.viewer.pictures import SCORES, UNSEEN, paint
 from r3jax.geometry.cameras import Camera, look_at
 from r3jax.runs.reader import Run
 

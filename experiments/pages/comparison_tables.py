@@ -25,10 +25,14 @@ from r3jax.apps.benchmark.tables import (
     with_name,
 )
 from r3jax.evaluation.comparison import (
+    RESAMPLES,
     Cell,
+    Scores,
     check_equal_terms,
+    mean_over_scenes,
     method_name,
     methods_of,
+    paired_difference,
     scenes_of,
     scores_by_method,
     seeds_by_method,
@@ -36,7 +40,6 @@ from r3jax.evaluation.comparison import (
     with_short_names,
 )
 from r3jax.evaluation.scores import POOR_PSNR, Metric
-from r3jax.evaluation.statistics import RESAMPLES, Scores, mean_over_scenes, paired_difference
 
 
 def tail_table(

@@ -21,8 +21,15 @@ from jaxtyping import Array, Bool, Float
 
 from r3jax.baselines.active_gs import EXPLORATION_WEIGHT, LOW_CONFIDENCE, draw_views
 from r3jax.baselines.information import with_room
-from r3jax.baselines.online_map import DISCS, OnlineMap, Seen, colored, supported_by
-from r3jax.baselines.policy import OnlinePolicy, memory_of
+from r3jax.baselines.online_map import (
+    DISCS,
+    OnlineMap,
+    OnlinePolicy,
+    Seen,
+    colored,
+    memory_of,
+    supported_by,
+)
 from r3jax.geometry.cameras import Camera, invert_pose, project, transform
 from r3jax.geometry.numerics import safe_norm
 from r3jax.kernels.calls import Cells
@@ -30,8 +37,7 @@ from r3jax.mapping.occupancy import OccupancyGrid, cells_of, world_to_cell
 from r3jax.planning.candidates import Candidates, draw_lots
 from r3jax.planning.decide import Drawn
 from r3jax.planning.policy import Situation
-from r3jax.splatting.backend import find_backend
-from r3jax.splatting.config import RasterConfig
+from r3jax.splatting.backend import RasterConfig, find_backend
 from r3jax.splatting.projection import rotation_rows
 from r3jax.splatting.scene import GaussianScene
 

@@ -21,7 +21,7 @@ from r3jax.baselines.pixels import PixelView, score_by_pixels
 from r3jax.planning.candidates import Candidates
 from r3jax.planning.decide import GreedyPolicy, Scored
 from r3jax.planning.policy import Situation
-from r3jax.scoring.directions import nearest_seen
+from r3jax.scoring.terms import nearest_seen
 
 UNSEEN_WEIGHT = 1000.0
 """Worth of a view that shows every cell of the grid, all unexplored (Active-GS)."""

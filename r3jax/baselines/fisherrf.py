@@ -31,13 +31,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from r3jax.baselines.information import on_cpu, pixel_squares, with_room
-from r3jax.baselines.online_map import BALLS
-from r3jax.baselines.policy import OnlineConfig, OnlinePolicy, memory_of
+from r3jax.baselines.online_map import BALLS, OnlineConfig, OnlinePolicy, memory_of
 from r3jax.errors import InputError
 from r3jax.geometry.cameras import Camera
 from r3jax.planning.candidates import Candidates, draw_lots
 from r3jax.planning.policy import Situation
-from r3jax.splatting.config import RasterConfig
+from r3jax.splatting.backend import RasterConfig
 from r3jax.splatting.scene import GaussianScene
 
 Criterion = Literal["ratio", "d-opt"]

@@ -25,14 +25,21 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from r3jax.baselines.information import on_cpu, pixel_tallies, with_room
-from r3jax.baselines.online_map import GAUSS_MI, OnlineMap, Seen, colored, show
-from r3jax.baselines.policy import OnlineConfig, OnlinePolicy, memory_of
+from r3jax.baselines.online_map import (
+    GAUSS_MI,
+    OnlineConfig,
+    OnlineMap,
+    OnlinePolicy,
+    Seen,
+    colored,
+    memory_of,
+    show,
+)
 from r3jax.geometry.cameras import Camera, angle_between
 from r3jax.geometry.numerics import safe_norm
 from r3jax.planning.candidates import Candidates, draw_lots
 from r3jax.planning.policy import Situation
-from r3jax.splatting.backend import find_backend
-from r3jax.splatting.config import RasterConfig
+from r3jax.splatting.backend import RasterConfig, find_backend
 from r3jax.splatting.scene import GaussianScene
 
 LIMIT = 10.0

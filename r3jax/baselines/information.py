@@ -20,9 +20,9 @@ from r3jax.geometry.cameras import Camera
 from r3jax.kernels import calls
 from r3jax.kernels.calls import Cloud, Drawn, Images
 from r3jax.kernels.native.platform import can_call_kernels
+from r3jax.splatting.backend import RasterConfig
 from r3jax.splatting.backends.numba import arguments, composite_forward
 from r3jax.splatting.backends.reference import composite_pixel
-from r3jax.splatting.config import RasterConfig, fitting_budget
 from r3jax.splatting.projection import project_gaussians
 from r3jax.splatting.scene import GaussianScene
 
@@ -118,8 +118,7 @@ def with_room(
     config = RasterConfig()
     result, overflow = function(config, scene, *args)
     while (missing := int(jnp.max(overflow))) > 0:
-        budget = fitting_budget(config.budget(scene.capacity) + missing)
-        config = RasterConfig(max_intersections=budget)
+        config = config.with_room(config.budget(scene.capacity) + missing)
         result, overflow = function(config, scene, *args)
     return result
 

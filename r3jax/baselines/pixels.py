@@ -2,7 +2,7 @@
 
 Active-GS, ActiveGAMER and COVER render their map from every candidate and average over pixels.
 Here the rendering is the nearest voxel of each pixel (`scoring.backend`), at most
-`config.zbuffer_size` wide.
+`VisibilityConfig.zbuffer_size` wide.
 
 Shape symbols: C candidates; h w pixels of the buffer; n voxels and c cells at hand; N rows of the
 map.

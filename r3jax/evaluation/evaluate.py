@@ -3,7 +3,6 @@
 Shape symbols: v views; H, W size of every image.
 """
 
-import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from r3jax.errors import InputError
 from r3jax.evaluation.image_metrics import in_batches, psnr, ssim, to_8_bits
 from r3jax.evaluation.scores import ViewRow
-from r3jax.splatting.config import RasterConfig, fitting_budget
+from r3jax.splatting.backend import RasterConfig
 from r3jax.splatting.render import render
 from r3jax.splatting.scene import GaussianScene
 from r3jax.splatting.views import Views
@@ -170,7 +169,7 @@ def _render_all(
                     f"view {name} needs {needed} intersections, but max_intersections is "
                     f"{config.max_intersections}: raise it, or leave it open"
                 )
-            config = dataclasses.replace(config, max_intersections=fitting_budget(needed))
+            config = config.with_room(needed)
             drawn = _draw(scene, views, jnp.asarray(i), background, config)
         if int(drawn.num_broken) > 0:
             raise InputError(

@@ -1,9 +1,9 @@
-"""Evaluates a model on test views: metrics, renderability, and the output files."""
+"""Evaluates a model on test views: metrics, the renderability that a map expected, and files."""
 
 import dataclasses
 import hashlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -14,15 +14,16 @@ import numpy as np
 from r3jax.errors import InputError
 from r3jax.evaluation.evaluate import Evaluation, evaluate
 from r3jax.evaluation.image_metrics import load_lpips
-from r3jax.evaluation.maps import expected_image, expected_renderability, map_of
 from r3jax.evaluation.scores import Summary, summarize, worst_rows, write_rows
 from r3jax.files import PNG_MARK, check_replaceable, holds, make_folder, write_atomic
 from r3jax.formats.captures import Capture, open_capture
 from r3jax.formats.errors import FormatError
 from r3jax.frame import Frame
-from r3jax.mapping.state import MapState
+from r3jax.mapping.state import MapState, empty_map
+from r3jax.mapping.update import integrate_growing
 from r3jax.runs.header import package_versions
-from r3jax.splatting.config import RasterConfig
+from r3jax.scoring.renderability import renderability, renderability_image
+from r3jax.splatting.backend import RasterConfig
 from r3jax.splatting.model import TrainedModel
 from r3jax.splatting.ply import read_scene
 from r3jax.splatting.views import Views, load_views
@@ -368,3 +369,43 @@ def warnings_of(judgment: Judgment) -> list[str]:
     if trained is not None and longer != trained:
         warnings.append(f"the model was trained at {trained} px and is evaluated at {longer} px")
     return warnings
+
+
+def map_of(
+    frames: Iterable[Frame],
+    *,
+    voxel_size: float = 0.05,
+    max_range: float = 5.0,
+    num_bins: int = 64,
+    drop_edges: bool = True,
+) -> MapState:
+    """Builds the map of these frames and no others; it grows as needed.
+
+    A run's own map contains the held-out views, too, and would overestimate a model trained without
+    them.
+
+    Args:
+        frames: those that the model was trained on.
+        voxel_size: edge of a voxel [m].
+        max_range: depth beyond it is ignored [m].
+        num_bins: direction bins per voxel.
+        drop_edges: False lets pixels on depth edges in.
+    """
+    state = empty_map(voxel_size=voxel_size, num_bins=num_bins)
+    for frame in frames:
+        state = integrate_growing(state, frame, max_range, drop_edges=drop_edges)
+    return state
+
+
+def expected_renderability(state: MapState, frames: Iterable[Frame]) -> list[float]:
+    """Computes R of each frame's view, in [0, 1].
+
+    The frames must be as recorded, not made smaller: a voxel's resolution is compared with the
+    one at which it was mapped.
+    """
+    return [float(renderability(state, f.camera, f.T_world_camera)) for f in frames]
+
+
+def expected_image(state: MapState, frame: Frame) -> np.ndarray:
+    """Computes R of the surface at each pixel of a frame's view, [h, w] in [0, 1]."""
+    return np.asarray(renderability_image(state, frame.camera, frame.T_world_camera))

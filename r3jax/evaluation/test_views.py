@@ -23,8 +23,7 @@ import numpy as np
 from r3jax.errors import InputError
 from r3jax.files import make_folder, write_atomic
 from r3jax.frame import Frame
-from r3jax.geometry.axis_views import LOOKS, poses_at
-from r3jax.geometry.cameras import Camera
+from r3jax.geometry.cameras import LOOKS, Camera, poses_at
 from r3jax.validation.errors import ForeignFileError, VersionError, check_version
 from r3jax.validation.files import read_bytes
 from r3jax.validation.json_text import check_fields, parse_json

@@ -11,7 +11,6 @@ from typing import Protocol, runtime_checkable
 import jax
 
 from r3jax.errors import InputError
-from r3jax.exploration.clock import make_clock
 from r3jax.exploration.config import Budget, ExplorationConfig, parse_budget
 from r3jax.exploration.guard import GuardedSimulator
 from r3jax.exploration.state import (
@@ -21,6 +20,7 @@ from r3jax.exploration.state import (
     Stop,
     StopReason,
     describe_counts,
+    make_clock,
 )
 from r3jax.exploration.step import relive, start_state, step
 from r3jax.exploration.taken_views import StepRow, TakenView

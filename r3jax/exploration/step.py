@@ -14,10 +14,9 @@ import jax
 import numpy as np
 
 from r3jax.exploration.captures import Leg, aim, begin_leg, observe_view
-from r3jax.exploration.clock import timed
 from r3jax.exploration.coverage import measure_coverage, view_renderability
 from r3jax.exploration.guard import first_pose
-from r3jax.exploration.state import LoopState, Mission, PlannedAhead, Stop, StopReason
+from r3jax.exploration.state import LoopState, Mission, PlannedAhead, Stop, StopReason, timed
 from r3jax.exploration.taken_views import (
     StepRow,
     TakenView,

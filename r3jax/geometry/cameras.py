@@ -4,8 +4,10 @@ World: right-handed, z up, meters. Camera: OpenCV axes (x right, y down, z forwa
 the 4x4 matrix `T_world_camera` that takes points from the camera to the world. Pixel centers
 lie at +0.5.
 
-Shape symbols: H, W image size; n points.
+Shape symbols: H, W image size; n points; V views.
 """
+
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -17,6 +19,9 @@ from jaxtyping import Array, Bool, Float, Num
 
 from r3jax.errors import InputError
 from r3jax.geometry.numerics import safe_norm
+
+LOOKS = ("+x", "-x", "+y", "-y", "+z", "-z")
+"""Names of the directions."""
 
 
 def _as_float32(value: ArrayLike) -> Float[Array, "..."]:
@@ -295,3 +300,22 @@ def is_rigid(T: Float[Array, "4 4"]) -> Bool[Array, ""]:
 def is_traced(*arrays: object) -> bool:
     """Returns True if any of the arrays is a tracer, whose values cannot be read."""
     return any(isinstance(x, Tracer) for x in arrays)
+
+
+_pose_along = jax.jit(pose_along)
+
+
+def poses_at(positions: np.ndarray, looks: Sequence[str] | np.ndarray) -> np.ndarray:
+    """Makes poses without roll, [V, 4, 4] float64, at positions [V, 3] [m] along "+x", "-x", ..."""
+    # Six poses, copied below: `pose_along` would dispatch to JAX once per view.
+    axes: dict[str, np.ndarray] = {}
+    for look in LOOKS:
+        direction = np.zeros(3, np.float32)
+        direction["xyz".index(look[1])] = 1.0 if look[0] == "+" else -1.0
+        # Entries are 0 or 1 up to rounding; adding 0 turns -0.0 into 0.0.
+        axes[look] = np.rint(_pose_along(np.zeros(3, np.float32), direction)) + 0.0
+    poses = np.zeros((len(looks), 4, 4))
+    for i, look in enumerate(looks):
+        poses[i] = axes[str(look)]
+    poses[:, :3, 3] = positions
+    return poses

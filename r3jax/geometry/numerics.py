@@ -28,13 +28,3 @@ def safe_power(base: Float[Array, "..."], exponent: Float[Array, "..."]) -> Floa
     power = jnp.exp(exponent * jnp.log(base_safe))
     at_zero = jnp.where(exponent == 0.0, 1.0, 0.0)
     return jnp.where(is_zero, at_zero, power)
-
-
-def safe_divide(
-    numerator: Float[Array, "..."], denominator: Float[Array, "..."]
-) -> Float[Array, "..."]:
-    """Computes `numerator / denominator`, and 0 where the denominator is 0."""
-    is_zero = denominator == 0.0
-    # An infinite quotient in the branch not taken would make the gradient NaN.
-    denominator_safe = jnp.where(is_zero, 1.0, denominator)
-    return jnp.where(is_zero, 0.0, numerator / denominator_safe)

@@ -41,18 +41,6 @@ def fibonacci_lattice(num: int) -> np.ndarray:
     return _lattice(num)
 
 
-def bins_for_angle(angle_deg: float | int) -> int:
-    """Computes the number of bins whose caps have the full opening `angle_deg` [deg].
-
-    A = 2 pi (1 - cos(angle / 2)), num = ceil(4 pi / A); 10 degrees give 526.
-    """
-    if not 0.0 < angle_deg <= 360.0:
-        raise InputError(f"angle_deg must lie in (0, 360], got {angle_deg}")
-    cap = 2.0 * math.pi * (1.0 - math.cos(0.5 * math.radians(angle_deg)))
-    # Rounding must not add a bin if the quotient is an integer (120 degrees: 4).
-    return math.ceil(4.0 * math.pi / cap - 1e-9)
-
-
 def octahedral_cell(directions: Float[Array, "3 n"], size: int) -> Int[Array, " n"]:
     """Finds the cell (row * size + column) of each direction on the octahedral map.
 

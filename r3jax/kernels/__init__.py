@@ -11,11 +11,10 @@ compiled. A test compares each with its formula.
 | `sums` | `scoring.formulas.sums_in_view` | `scoring/test_backends.py` |
 | `changes` | `scoring.formulas.change_of_sums` | `scoring/test_backends.py` |
 | `pixels` | `scoring.formulas.rows_in_pixels` | `scoring/test_backends.py` |
-| `terms` | `scoring.terms.score_voxels` | `scoring/test_backends.py` |
 | `gains`, `add` | `apps.select.objective.Objective` | `apps/select/test_objective.py` |
 | `composite` | `splatting.backends.reference.rasterize` | `splatting/backends/test_numba.py` |
 | `composite_gradient` | the same, by `jax.grad` | `splatting/backends/test_numba.py` |
-| `image_loss` | `splatting.training.loss.photometric_loss` | `splatting/training/test_kernels.py` |
+| `image_loss` | `training.train_step.photometric_loss` | `splatting/training/test_kernels.py` |
 | `adam` | `splatting.training.optimizer.adam_update` | `splatting/training/test_kernels.py` |
 | `squares` | `baselines.information.pixel_squares` | `baselines/test_information.py` |
 | `tallies` | `baselines.information.pixel_tallies` | `baselines/test_information.py` |

@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from r3jax.kernels.adam import adam_pass
 from r3jax.kernels.calls import Cells, FrameArrays, Layout, MapRows, Views
+from r3jax.kernels.image_loss import loss_pass
 from r3jax.kernels.mapping.add import map_add
-from r3jax.kernels.mapping.mark import map_mark
-from r3jax.kernels.mapping.miss import map_miss
+from r3jax.kernels.mapping.mark import map_mark, map_miss
 from r3jax.kernels.native.compiled import inlined
 from r3jax.kernels.native.ffi import (
     ARGUMENTS,
@@ -30,14 +31,10 @@ from r3jax.kernels.native.ffi import (
 )
 from r3jax.kernels.scoring.changes import changes
 from r3jax.kernels.scoring.pixels import pixels
-from r3jax.kernels.scoring.rows import Terms, terms
 from r3jax.kernels.scoring.sums import Sums, Tables, sums
 from r3jax.kernels.scoring.terms import Choices
 from r3jax.kernels.splatting.passes import backward_pass, forward_pass
-from r3jax.kernels.splatting.squares import squares_pass
-from r3jax.kernels.splatting.tallies import tallies_pass
-from r3jax.kernels.training.adam import adam_pass
-from r3jax.kernels.training.image_loss import loss_pass
+from r3jax.kernels.splatting.squares import squares_pass, tallies_pass
 
 # Indices of arguments are literals, so that LLVM can inline all of this.
 
@@ -189,26 +186,6 @@ def _pixels(frame):
         floats1(frame, RESULTS, 0),
         ints2(frame, RESULTS, 1),
     )
-    return 0
-
-
-def _terms(frame):
-    """Arguments: map (6), positions, focal lengths, options, directions of a voxel's bins."""
-    if answers_metadata(frame):
-        return 0
-    options = ints1(frame, ARGUMENTS, 8)
-    terms(
-        _map(frame, 0),
-        floats2(frame, ARGUMENTS, 6),
-        floats1(frame, ARGUMENTS, 7),
-        Choices(options[0] != 0, options[1] != 0),
-        floats2(frame, ARGUMENTS, 9),
-        np.int64(options[2]),
-        Terms(
-            floats2(frame, RESULTS, 0), floats2(frame, RESULTS, 1), floats2(frame, RESULTS, 2),
-            floats2(frame, RESULTS, 3), floats2(frame, RESULTS, 4), floats2(frame, RESULTS, 5),
-        ),
-    )  # fmt: skip
     return 0
 
 
@@ -373,7 +350,6 @@ HANDLERS = {
     "map_miss": _map_miss,
     "pixels": _pixels,
     "changes": _changes,
-    "terms": _terms,
     "composite": _composite,
     "composite_gradient": _composite_gradient,
     "image_loss": _image_loss,

@@ -363,21 +363,6 @@ def pixels(
     return means, found
 
 
-def terms(
-    rows: MapRows, position: Float[Array, "P 3"], focal: Float[Array, " P"], forms: Forms,
-    voxel_bins: int,
-) -> tuple[Float[Array, "P N"], ...]:  # fmt: skip
-    """Computes the terms of R of every row, hidden or not: `scoring.terms.score_voxels`.
-
-    Returns:
-        kappa, bias, delta, noise, resolution and R; all NaN if a position is not finite.
-    """
-    # An array for each term: none is copied out of one for all.
-    term = jax.ShapeDtypeStruct((position.shape[0], rows.counts.shape[0]), jnp.float32)
-    options = _options(*_choices(forms))
-    return _call("terms", [term] * 6, (rows, position, focal, options, _lattice(voxel_bins)))
-
-
 def composite(
     cloud: Cloud, view: Float[Array, " 19"], size: tuple[int, int], budget: int
 ) -> tuple[Images, Int[Array, " 2"], Drawn]:
@@ -451,7 +436,7 @@ def tallies(
 def image_loss(
     rgb: Float[Array, "H W 3"], target: Float[Array, "H W 3"], weight: Float[Array, ""]
 ) -> tuple[Float[Array, " 2"], Float[Array, "H W 3"]]:
-    """Computes `splatting.training.loss.loss_and_error`, and the gradient of the loss."""
+    """Computes `splatting.training.train_step.loss_and_error`, and the gradient of the loss."""
     height, width, _ = rgb.shape
     flat = [image.reshape(height, 3 * width) for image in (rgb, target)]
     shapes = [jax.ShapeDtypeStruct((2,), jnp.float32), _like(flat[0])]

@@ -25,9 +25,8 @@ from r3jax.kernels import calls
 from r3jax.kernels.calls import Cells
 from r3jax.kernels.native.platform import call_of_many
 from r3jax.mapping.state import MapState
-from r3jax.visibility.config import VisibilityConfig
 from r3jax.visibility.depth_buffer import visible
-from r3jax.visibility.views import View, for_kernels, layout_of, pinhole_view
+from r3jax.visibility.views import View, VisibilityConfig, for_kernels, layout_of, pinhole_view
 
 _Marks = tuple[UInt32[Array, "W N"], Float[Array, " N"]]
 """A map's direction bins and best resolutions."""

@@ -21,9 +21,7 @@ from r3jax.kernels.native.platform import call_of_many
 from r3jax.mapping.state import MapState
 from r3jax.scoring import formulas
 from r3jax.scoring.config import ScoringConfig
-from r3jax.scoring.terms import Renderability
-from r3jax.visibility.config import VisibilityConfig
-from r3jax.visibility.views import View, for_kernels, layout_of
+from r3jax.visibility.views import View, VisibilityConfig, for_kernels, layout_of
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(6,))
@@ -178,26 +176,3 @@ def _rows_in_pixels_jvp(primals: Any, tangents: Any) -> Any:
     del tangents  # a choice has no derivative
     rows = rows_in_pixels(*primals)
     return rows, np.zeros(rows.shape, dtype=jax.dtypes.float0)
-
-
-@functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
-def terms_of_rows(
-    voxels: MapState, position: Float[Array, " 3"], focal: Float[Array, ""], forms: Forms
-) -> Renderability:
-    """Computes `formulas.terms_of_rows`."""
-
-    def kernel(voxels: MapState, items: Any) -> tuple[Array, ...]:
-        position, focal = items
-        return calls.terms(voxels.rows, position, focal, forms, voxels.num_bins)
-
-    def formula(voxels: MapState, item: Any) -> tuple[Array, ...]:
-        position, focal = item
-        return tuple(jax.tree.leaves(formulas.terms_of_rows(voxels, position, focal, forms)))
-
-    item = (position, focal)
-    return Renderability(*call_of_many(kernel, formula, voxels, item, voxels.capacity))
-
-
-@terms_of_rows.defjvp
-def _terms_of_rows_jvp(forms: Forms, primals: Any, tangents: Any) -> Any:
-    return jax.jvp(functools.partial(formulas.terms_of_rows, forms=forms), primals, tangents)

@@ -1,20 +1,25 @@
-"""Scores many candidates against one map: the inner loop of planning.
+"""Scores of many candidates against one map: the inner loop of planning.
 
-One call scores all candidates. Several devices share the candidates; a score without a CPU kernel,
-which would use one core, is split over threads.
+One call scores all candidates. Several devices share the candidates: each has the whole map. A
+share is a loop over its candidates. The partitioner of jit would run all of it on every device;
+`shard_map` runs each share on its own device. A score without a CPU kernel, which would use one
+core, is split over threads.
 
-Shape symbols: C candidates; n voxels; c cells; B bins of the panorama.
+Shape symbols: C candidates; n voxels; c cells; B bins of the panorama; D devices; P candidates
+padded to a multiple of D.
 """
 
 import functools
 import operator
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float
 
 from r3jax.geometry.cameras import Camera, is_traced
@@ -24,14 +29,21 @@ from r3jax.mapping.occupancy import OccupancyGrid, cells_of
 from r3jax.mapping.state import MapState
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.gather import gather_in_range
-from r3jax.scoring.panorama import Panorama, panorama_of
-from r3jax.scoring.panorama_cache import (
+from r3jax.scoring.panorama import (
+    Panorama,
     PanoramaCache,
     cached_panorama,
     panorama_from_cache,
+    panorama_of,
 )
-from r3jax.scoring.sharding import Candidates, padded_to, score_on_devices
 from r3jax.scoring.utility import ViewUtility, utility_of_view
+
+_AXIS = "candidates"
+
+
+Candidates = Any
+"""An array with a row for each candidate, [C, ...], or a tree of such arrays."""
+
 
 Scores = TypeVar("Scores")
 
@@ -242,3 +254,68 @@ def map_over_devices(
     with ThreadPoolExecutor(workers) as pool:
         parts = list(pool.map(lambda part: jax.block_until_ready(score(part)), shares))
     return jax.tree.map(lambda *arrays: jnp.concatenate(arrays)[:num], *parts)
+
+
+def padded_to(multiple: int, candidates: Candidates) -> Candidates:
+    """Repeats the last candidate until their number is a multiple."""
+
+    def pad(rows: Array) -> Array:
+        missing = -rows.shape[0] % multiple
+        if missing == 0:
+            return rows  # not copied: caches of a hundred panoramas take megabytes
+        last = jnp.broadcast_to(rows[-1:], (missing, *rows.shape[1:]))
+        return jnp.concatenate([rows, last])
+
+    return jax.tree.map(pad, candidates)
+
+
+def score_on_devices(
+    score: Callable[..., Any],
+    known: tuple[Any, ...],
+    candidates: Candidates,
+    devices: Sequence[Any],
+) -> Any:
+    """Computes `score(*known, candidates)` with the candidates spread over the devices.
+
+    Each candidate's score is computed as on one device: the numbers are equal, except for the last
+    bits if a share is a single candidate, whose loop XLA unrolls and fuses differently.
+
+    Args:
+        score: a module-level function of `known` and of any number of candidates, so that it
+            compiles once; gives fields of shape [C, ...].
+        known: the same for all candidates, copied to each device; other values than numbers and
+            arrays, such as functions, are passed unchanged.
+        candidates: the candidates.
+        devices: of JAX, all of one kind.
+
+    Returns:
+        Fields of shape [P, ...], D shards along the first axis; rows from C on are padding.
+    """
+    mesh = Mesh(np.asarray(devices), (_AXIS,))
+    apart = NamedSharding(mesh, PartitionSpec(_AXIS))
+    everywhere = NamedSharding(mesh, PartitionSpec())
+    # There may be a function among them (`score_pixels`), which no device can hold.
+    numbers, others = eqx.partition(known, eqx.is_array_like)
+    numbers = jax.device_put(numbers, everywhere)
+    shares = jax.device_put(padded_to(len(devices), candidates), apart)
+    return _score(score, mesh, eqx.combine(numbers, others), shares)
+
+
+@eqx.filter_jit
+def _score(
+    score: Callable[..., Any],
+    mesh: Mesh,
+    known: tuple[Any, ...],
+    candidates: Candidates,
+) -> Any:
+    arrays, others = eqx.partition(known, eqx.is_array)
+
+    def own(arrays: Any, share: Any) -> Any:
+        return score(*eqx.combine(arrays, others), share)
+
+    split = PartitionSpec(_AXIS)
+    # The loops inside start from replicated constants and end in values that vary by device.
+    spread = jax.shard_map(
+        own, mesh=mesh, in_specs=(PartitionSpec(), split), out_specs=split, check_vma=False
+    )
+    return spread(arrays, candidates)

@@ -11,7 +11,7 @@ from r3jax.geometry.arguments import a_camera, a_pose, checked, one, or_none
 from r3jax.geometry.cameras import is_traced
 from r3jax.kernels.calls import Forms
 from r3jax.mapping.state import a_map
-from r3jax.visibility.config import VisibilityConfig, as_float32
+from r3jax.visibility.views import VisibilityConfig, as_float32
 
 PAPER = Forms()
 """The paper's equations and algorithms."""

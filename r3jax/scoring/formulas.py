@@ -17,10 +17,9 @@ from r3jax.geometry.sphere import nearest_bin
 from r3jax.kernels.calls import Cells
 from r3jax.mapping.state import MapState
 from r3jax.scoring.config import Forms, ScoringConfig
-from r3jax.scoring.terms import Renderability, score_voxels
-from r3jax.visibility.config import VisibilityConfig
+from r3jax.scoring.terms import score_voxels
 from r3jax.visibility.depth_buffer import depth_buffer, visible
-from r3jax.visibility.views import View
+from r3jax.visibility.views import View, VisibilityConfig
 
 
 def sums_in_view(
@@ -142,15 +141,6 @@ def mean_of_rows(
     """Averages R over the pixels of an image; pixels without a voxel count as 0."""
     shown = voxels_of_rows(voxels, rows)
     return jnp.mean(score_voxels(shown, position, focal, forms).value)
-
-
-def terms_of_rows(
-    voxels: MapState, position: Float[Array, " 3"], focal: Float[Array, ""], forms: Forms
-) -> Renderability:
-    """Computes `score_voxels` of every row; NaN if the position is not finite."""
-    factor = jnp.where(jnp.all(jnp.isfinite(position)), 1.0, jnp.nan)
-    terms = score_voxels(voxels, position, focal, forms)
-    return jax.tree.map(lambda term: factor * term, terms)
 
 
 def voxels_of_rows(voxels: MapState, rows: Int[Array, "h w"]) -> MapState:

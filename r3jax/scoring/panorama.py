@@ -1,12 +1,16 @@
-"""The panorama of a position: the utility of every direction at once, and the best one.
+"""The panorama of a position: the utility of all directions at once, and the best one.
 
-Shape symbols: B bins of the panorama.
+Imagined views (`scoring.simulated`) change the R of voxels and the unexplored cells, but no
+surface: visibility, the most expensive part of a panorama, stays the same. So a search over paths
+determines visibility once (`PanoramaCache`) and then only updates the sums.
+
+Shape symbols: n voxels; c cells; p and q their bits, packed in bytes; B bins of the panorama.
 """
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from r3jax.geometry.arguments import a_camera, a_point, checked
 from r3jax.geometry.cameras import Camera, nan_unless_valid, pose_along
@@ -14,9 +18,27 @@ from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.kernels.calls import Cells
 from r3jax.mapping.occupancy import OccupancyGrid, a_grid, cells_of
 from r3jax.mapping.state import MapState, a_map
-from r3jax.scoring.backend import sums_in_view
+from r3jax.scoring.backend import change_of_sums, sums_and_seen, sums_in_view
 from r3jax.scoring.config import ScoringConfig, scoring_settings
 from r3jax.visibility.views import panorama_view
+
+
+class PanoramaCache(eqx.Module):
+    """The cache of one or many panoramas: a bit for every gathered voxel and cell."""
+
+    bin_scores: Float[Array, "*positions B"]
+    """As in `Panorama`."""
+
+    voxels: UInt8[Array, "*positions p"]
+    """Which voxels the position sees."""
+
+    cells: UInt8[Array, "*positions q"]
+    """Which unexplored cells it sees."""
+
+    @jax.jit
+    def at(self, index: Int[Array, " k"]) -> "PanoramaCache":
+        """Selects the caches of some positions out of many."""
+        return PanoramaCache(self.bin_scores[index], self.voxels[index], self.cells[index])
 
 
 class Panorama(eqx.Module):
@@ -117,3 +139,48 @@ def bins_in_view(camera: Camera, num_bins: int) -> Float[Array, "B B"]:
     row = camera.fy * y / z_safe + camera.cy
     is_in = (column >= 0.0) & (column < camera.width) & (row >= 0.0) & (row < camera.height)
     return (is_ahead & is_in).astype(jnp.float32)
+
+
+def cached_panorama(
+    voxels: MapState,
+    cells: Cells,
+    camera: Camera,
+    position: Float[Array, " 3"],
+    config: ScoringConfig,
+    allowed: Bool[Array, " B"] | None = None,
+) -> tuple[Panorama, PanoramaCache]:
+    """Computes `panorama_of`, and caches what is needed to score it again."""
+    view, num_bins = panorama_view(position, config), config.panorama_bins
+    deficits, unexplored, *seen = sums_and_seen(voxels, cells, view, camera.focal, config, num_bins)
+    bins = deficits + config.lambda1 * unexplored
+    kept = PanoramaCache(bins, *seen)
+    return panorama_of_bins(bins, camera, position, config, allowed), kept
+
+
+def panorama_from_cache(
+    kept: PanoramaCache,
+    before: tuple[MapState, Cells],
+    after: tuple[MapState, Cells],
+    camera: Camera,
+    position: Float[Array, " 3"],
+    config: ScoringConfig,
+    allowed: Bool[Array, " B"] | None = None,
+) -> Panorama:
+    """Updates `panorama_of` after imagined views, from the cache before them.
+
+    Args:
+        kept: the cache of this position.
+        before: the voxels and cells that it was computed from.
+        after: the same after any number of imagined views (`simulate_view_near`).
+        camera: whose field of view and focal length count.
+        position: camera center [m].
+        config: as for the cache.
+        allowed: as in `panorama_of`.
+    """
+    seen = (kept.voxels, kept.cells)
+    change, gone = change_of_sums(
+        before, after, seen, position, camera.focal, config, config.panorama_bins
+    )
+    # Rounding may leave a difference of sums just below 0.
+    bins = jnp.maximum(kept.bin_scores + change - config.lambda1 * gone, 0.0)
+    return panorama_of_bins(bins, camera, position, config, allowed)

@@ -19,7 +19,7 @@ from r3jax.errors import InputError
 from r3jax.geometry.arguments import a_point, checked
 from r3jax.geometry.cameras import Camera, is_traced, nan_unless_valid
 from r3jax.mapping.state import MapState, a_map
-from r3jax.scoring.backend import mean_in_pixels, rows_in_pixels, terms_of_rows
+from r3jax.scoring.backend import mean_in_pixels, rows_in_pixels
 from r3jax.scoring.config import Forms, ScoringConfig, checked_view
 from r3jax.scoring.formulas import voxels_of_rows
 from r3jax.scoring.terms import Renderability, score_voxels
@@ -32,8 +32,10 @@ def _voxel_renderability(
 ) -> Renderability:
     positive = jnp.stack([focal, state.voxel_size])
     is_valid = jnp.all(jnp.isfinite(positive) & (positive > 0.0))
-    position = jnp.where(is_valid, camera_position, jnp.nan)
-    return terms_of_rows(state, position, focal, forms)
+    is_valid &= jnp.all(jnp.isfinite(camera_position))
+    factor = jnp.where(is_valid, 1.0, jnp.nan)
+    terms = score_voxels(state, camera_position, focal, forms)
+    return jax.tree.map(lambda term: factor * term, terms)
 
 
 @checked(state=a_map)
@@ -121,9 +123,9 @@ def renderability_image(
 ) -> Float[Array, "h w"]:
     """Computes R of the voxel in each pixel of a view; 0 where there is none.
 
-    The image is a depth buffer of the voxels, at most `config.zbuffer_size` pixels wide or high,
-    with the camera's field of view. Differentiable with respect to the pose: the voxel in each
-    pixel is held fixed, its R varies. This is one of the `term_images`.
+    The image is a depth buffer of the voxels, at most `VisibilityConfig.zbuffer_size` pixels wide
+    or high, with the camera's field of view. Differentiable with respect to the pose: which voxel
+    a pixel sees is held fixed, its R varies. One of `term_images`.
     """
     return term_images(state, camera, T_world_camera, config).value
 

@@ -2,19 +2,23 @@
 
     R = bias x noise x resolution        (arXiv 2601.07484)
 
-Shape symbols: n voxels.
+Shape symbols: n voxels; W words of bins; B bins.
 """
 
+import functools
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, UInt32
 
 from r3jax.geometry.numerics import safe_norm, safe_power
+from r3jax.geometry.sphere import fibonacci_lattice
+from r3jax.kernels.constants import ON_EDGE
 from r3jax.mapping.state import MapState
 from r3jax.scoring.config import PAPER, Forms
-from r3jax.scoring.directions import seen_directions
 
 
 class Renderability(eqx.Module):
@@ -94,3 +98,116 @@ def score_voxels(
         resolution=blank(resolution),
         value=blank(bias * noise * resolution),
     )
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
+def seen_directions(
+    visited: UInt32[Array, "W n"], direction: Float[Array, "3 n"], num_bins: int
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Compares new directions with the bins from which voxels were seen.
+
+    Per voxel, with r the new direction and q_k the visited bins (arXiv 2601.07484):
+
+        cosine = max_k <q_k, r>, clamped to [0, 1]
+        inside = 1 if the origin lies in the bounding box of the bins with <q_k, r> > 0,
+                 projected on the tangent plane at r; else 0
+
+    Only signs of the tangent coordinates matter for the box, so the axes up x r and r x (up x r)
+    are left unnormalized. The loop runs over bins and is vectorized over voxels; its cost is about
+    20 operations per bin and voxel.
+
+    Args:
+        visited: bit `k % 32` of word `k // 32` for each visited bin k.
+        direction: unit vectors from the voxels to the camera.
+        num_bins: number of bins B.
+
+    Returns:
+        `cosine` and `inside`. The derivative of `cosine` is that of the nearest bin's product;
+        `inside` is piecewise constant.
+    """
+    # One array of pairs behind a branch: otherwise XLA on a CPU would fuse, and so repeat, the scan
+    # over the bins into every kernel that uses one of its results.
+    pairs = jax.lax.cond(
+        jnp.any(visited != jnp.uint32(0)),
+        lambda: jax.lax.complex(*_scan(visited, direction, num_bins)[:2]),
+        lambda: jnp.zeros(direction.shape[1], dtype=jnp.complex64),
+    )
+    return pairs.real, pairs.imag
+
+
+@seen_directions.defjvp
+def _seen_directions_jvp(
+    num_bins: int,
+    primals: tuple[UInt32[Array, "W n"], Float[Array, "3 n"]],
+    tangents: tuple[Any, Float[Array, "3 n"]],
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    visited, direction = primals
+    cosine, inside, nearest = _scan(visited, direction, num_bins, keep_nearest=True)
+    moved = sum(nearest[axis] * tangents[1][axis] for axis in range(3))
+    is_free = (cosine > 0.0) & (cosine < 1.0)  # the clamp is flat outside
+    return (cosine, inside), (jnp.where(is_free, moved, 0.0), jnp.zeros_like(inside))
+
+
+def nearest_seen(
+    visited: UInt32[Array, "W ..."], direction: Float[Array, "3 ..."], num_bins: int
+) -> Float[Array, "..."]:
+    """Computes the cosine max_k <q_k, r> over the visited bins, in [-1, 1].
+
+    It is -1 if no bin was visited.
+
+    Args:
+        visited: as in `seen_directions`.
+        direction: unit vectors from the voxels to the camera.
+        num_bins: number of bins B.
+    """
+    x, y, z = direction
+    best = jnp.full_like(x, -1.0)
+    for k, (q_x, q_y, q_z) in enumerate(fibonacci_lattice(num_bins).astype("float32").tolist()):
+        is_visited = (visited[k // 32] & jnp.uint32(1 << (k % 32))) != jnp.uint32(0)
+        cosine = q_x * x + q_y * y + q_z * z
+        best = jnp.maximum(best, jnp.where(is_visited, cosine, -1.0))
+    return best
+
+
+# Jitted: a thousand operations are then traced once per size, not once per program.
+@functools.partial(jax.jit, static_argnames=("num_bins", "keep_nearest"))
+def _scan(
+    visited: UInt32[Array, "W n"],
+    direction: Float[Array, "3 n"],
+    num_bins: int,
+    *,
+    keep_nearest: bool = False,
+) -> tuple[Float[Array, " n"], Float[Array, " n"], tuple[Array, ...]]:
+    x, y, z = direction
+    is_pole = x * x + y * y < 1e-12
+    # Tangent axes: a = up x r = (-y, x, 0), or the x axis at the poles; b = r x a.
+    a_x, a_y = jnp.where(is_pole, 1.0, -y), jnp.where(is_pole, 0.0, x)
+    b_x, b_y, b_z = -z * a_y, z * a_x, x * a_y - y * a_x
+    # A voxel without bins keeps -1, which the clamp turns into 0.
+    lowest, zero = jnp.full_like(x, -1.0), jnp.zeros_like(x)
+    best, nearest = lowest, (zero, zero, zero)
+    # Empty boxes have inverted bounds, so that they do not contain the origin.
+    a_low = b_low = jnp.full_like(x, jnp.inf)
+    a_high = b_high = jnp.full_like(x, -jnp.inf)
+    # Python floats: the lattice becomes constants of the program, without a gather.
+    for k, (q_x, q_y, q_z) in enumerate(fibonacci_lattice(num_bins).astype("float32").tolist()):
+        is_visited = (visited[k // 32] & jnp.uint32(1 << (k % 32))) != jnp.uint32(0)
+        cosine = jnp.where(is_visited, q_x * x + q_y * y + q_z * z, -1.0)
+        if keep_nearest:
+            is_better = cosine > best
+            nearest = tuple(
+                jnp.where(is_better, q, old)
+                for q, old in zip((q_x, q_y, q_z), nearest, strict=True)
+            )
+        best = jnp.maximum(best, cosine)
+        # By the paper's text the bins on the camera's side of the tangent plane span the box.
+        is_ahead = cosine > 0.0
+        a = q_x * a_x + q_y * a_y
+        b = q_x * b_x + q_y * b_y + q_z * b_z
+        a_low = jnp.minimum(a_low, jnp.where(is_ahead, a, jnp.inf))
+        a_high = jnp.maximum(a_high, jnp.where(is_ahead, a, -jnp.inf))
+        b_low = jnp.minimum(b_low, jnp.where(is_ahead, b, jnp.inf))
+        b_high = jnp.maximum(b_high, jnp.where(is_ahead, b, -jnp.inf))
+    is_inside = (a_low <= ON_EDGE) & (a_high >= -ON_EDGE)
+    is_inside &= (b_low <= ON_EDGE) & (b_high >= -ON_EDGE)
+    return jnp.clip(best, 0.0, 1.0), is_inside.astype(x.dtype), nearest

@@ -1,15 +1,12 @@
 """Renders a scene of Gaussians: one signature over all backends."""
 
-import dataclasses
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from r3jax.geometry.arguments import a_camera, a_point, a_pose, checked, one, or_none
 from r3jax.geometry.cameras import Camera, is_traced, nan_unless_valid
-from r3jax.splatting.backend import Composite, find_backend
-from r3jax.splatting.config import RasterConfig, fitting_budget
+from r3jax.splatting.backend import Composite, RasterConfig, find_backend
 from r3jax.splatting.scene import GaussianScene, a_scene
 
 
@@ -82,8 +79,7 @@ def render(
     composite = rasterize(scene, camera, T_world_camera, center_offsets, config)
     is_open = config.max_intersections is None and not is_traced(composite.overflow)
     while is_open and int(composite.overflow) > 0:
-        budget = fitting_budget(int(composite.num_intersections))
-        config = dataclasses.replace(config, max_intersections=budget)
+        config = config.with_room(int(composite.num_intersections))
         composite = rasterize(scene, camera, T_world_camera, center_offsets, config)
     return _finish(composite, background, nan_unless_valid(camera, T_world_camera))
 

@@ -26,8 +26,7 @@ from r3jax.kernels.constants import (
     SEAM,
     STRIDES,
 )
-from r3jax.visibility.config import VisibilityConfig
-from r3jax.visibility.views import Placement, View, wrap
+from r3jax.visibility.views import Placement, View, VisibilityConfig, wrap
 
 
 class DepthBuffer(eqx.Module):

@@ -7,6 +7,8 @@ Besides its place every point gets scales: the sum of the absolute derivatives o
 along the world's three axes. Half of it times the edge of a voxel is how far the voxel's projection
 reaches, exactly to first order, whichever way the voxel is turned.
 
+Settings are traced, so that a sweep over them compiles once.
+
 Shape symbols: n points; h w size of the view.
 """
 
@@ -19,9 +21,39 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from r3jax.errors import InputError
 from r3jax.geometry.cameras import Camera
 from r3jax.kernels import calls
-from r3jax.visibility.config import VisibilityConfig
+
+
+def as_float32(value: float | Array) -> Float[Array, ""]:
+    """Converts a setting, so that Python numbers and arrays compile to the same program."""
+    return jnp.asarray(value, dtype=jnp.float32)
+
+
+class VisibilityConfig(eqx.Module):
+    """How far a camera sees, and how fine the depth buffers are."""
+
+    max_range: Float[Array, ""] = eqx.field(default=5.0, converter=as_float32)
+    """Range of the sensor: nothing farther away counts as visible [m]."""
+
+    tolerance: Float[Array, ""] = eqx.field(default=2.0, converter=as_float32)
+    """A voxel this far behind the depth buffer, across the surface in it, still counts as
+    visible [voxels]. Centers lie up to 1.7 voxels apart along a ray that crosses a single
+    surface; 2 agrees best with ray casting."""
+
+    zbuffer_size: int = eqx.field(default=128, static=True)
+    """Longest side of the pinhole depth buffer [px]; never more than the image's."""
+
+    panorama_size: int = eqx.field(default=256, static=True)
+    """Side of the octahedral depth buffer round a position [px]; a power of two."""
+
+    def __check_init__(self) -> None:
+        """Refuses a side that the octahedral map cannot have."""
+        # Powers of two halve exactly, so that the borders of every level of the pyramid wrap alike.
+        if self.panorama_size < 2 or self.panorama_size & (self.panorama_size - 1):
+            raise InputError(f"panorama_size must be a power of two, got {self.panorama_size}")
+
 
 Coordinates = Float[Array, "3 n"] | tuple[Array, Array, Array]
 """x, y and z of points [m], as one array or three."""
@@ -227,7 +259,7 @@ def for_kernels(view: View, tolerance: Float[Array, ""], focal: Float[Array, ""]
 def pinhole_view(
     camera: Camera, T_world_camera: Float[Array, "4 4"], config: VisibilityConfig
 ) -> PinholeView:
-    """Makes the view of a camera, with at most `config.zbuffer_size` pixels on its longest side.
+    """Makes the view of a camera, its longest side at most `VisibilityConfig.zbuffer_size` pixels.
 
     Visibility is piecewise constant, so no derivative passes through the pose.
     """

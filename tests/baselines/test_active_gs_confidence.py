@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 import r3jax
-from r3jax.baselines import confidence, normals
-from r3jax.baselines.confidence import aligned, no_sightings, see
-from r3jax.baselines.normals import pixel_normals
+from r3jax.baselines import confidence
+from r3jax.baselines.confidence import aligned, no_sightings, pixel_normals, see
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, look_at
 from r3jax.geometry.voxels import unpack
@@ -223,7 +222,7 @@ def test_edges_and_holes() -> None:
 
 
 def units(depth: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    vectors = normals.pixel_normals(
+    vectors = confidence.pixel_normals(
         CAMERA, jnp.asarray(depth, jnp.float32), jnp.asarray(valid), jnp.float32(VOXEL)
     )
     vectors = np.asarray(vectors, np.float64).reshape(3, 12, 128).transpose(1, 2, 0)

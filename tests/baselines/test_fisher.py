@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from r3jax.baselines import fisherrf
 from r3jax.baselines.fisherrf import Form, greedy_batch, known_information, scores
 from r3jax.geometry.cameras import look_at
-from r3jax.splatting import harmonics
-from r3jax.splatting.config import RasterConfig
+from r3jax.splatting import projection
+from r3jax.splatting.backend import RasterConfig
 from r3jax.splatting.render import render
 from tests.splatting.clouds import random_cloud, safe_pixels, view
 
@@ -66,7 +66,7 @@ def test_information_is_the_sum_of_squared_dense_jacobians() -> None:
     scene, camera, pose = a_case()
     with pytest.MonkeyPatch.context() as patch:
         # Forward mode cannot pass a gradient that is written out.
-        patch.setattr(harmonics, "_sum_harmonics", harmonics._sum_harmonics.fun)
+        patch.setattr(projection, "_sum_harmonics", projection._sum_harmonics.fun)
         expected = {q: dense_information(scene, camera, pose, quirk=q) for q in (False, True)}
     for quirk in (False, True):
         form = Form(quirk=quirk, background=BEHIND)

@@ -10,7 +10,7 @@ from r3jax.baselines import gauss_mi
 from r3jax.baselines.information import pixel_tallies
 from r3jax.baselines.online_map import Seen
 from r3jax.geometry.cameras import look_at
-from r3jax.splatting.config import RasterConfig
+from r3jax.splatting.backend import RasterConfig
 from tests.splatting.clouds import random_cloud, view
 
 CONFIG = RasterConfig(max_intersections=1 << 12)

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from r3jax.baselines import information
 from r3jax.baselines.information import pixel_squares, pixel_tallies, with_room
 from r3jax.geometry.cameras import Camera
-from r3jax.splatting import harmonics
-from r3jax.splatting.config import RasterConfig
+from r3jax.splatting import projection
+from r3jax.splatting.backend import RasterConfig
 from r3jax.splatting.render import render
 from tests.splatting.clouds import random_cloud, safe_pixels, view
 
@@ -42,7 +42,7 @@ def assert_same(found, expected, tolerance=1e-4):
 
 def test_squares_are_those_of_the_dense_jacobian(monkeypatch):
     # Forward mode cannot pass a gradient that is written out.
-    monkeypatch.setattr(harmonics, "_sum_harmonics", harmonics._sum_harmonics.fun)
+    monkeypatch.setattr(projection, "_sum_harmonics", projection._sum_harmonics.fun)
     scene = random_cloud(3, COUNT, 1)
     camera, pose = view(16, 16)
     assert safe_pixels(scene, camera, pose).all()

@@ -34,9 +34,9 @@ from r3jax.baselines.online_map import (
     supported_by,
     turned_to,
 )
-from r3jax.exploration.clock import compilations
+from r3jax.exploration.state import compilations
 from r3jax.geometry.cameras import Camera, pose_along
-from r3jax.splatting.config import RasterConfig
+from r3jax.splatting.backend import RasterConfig
 from r3jax.splatting.projection import rotation_rows
 from r3jax.splatting.render import render
 from r3jax.splatting.training.optimizer import empty_moments

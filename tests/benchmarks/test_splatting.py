@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from r3jax.geometry.cameras import Camera, look_at
-from r3jax.splatting.config import RasterConfig
+from r3jax.splatting.backend import RasterConfig
 from r3jax.splatting.render import render
 from r3jax.splatting.scene import GaussianScene
 

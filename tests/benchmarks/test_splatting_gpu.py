@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from r3jax.geometry.cameras import invert_pose
+from r3jax.splatting.backend import RasterConfig
 from r3jax.splatting.backends.splax import load_splax
-from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.render import render
 from tests.benchmarks.test_splatting import SIZES, room_cloud, room_view
 

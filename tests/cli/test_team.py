@@ -10,7 +10,7 @@ from r3jax.cli.main import main
 from r3jax.files import lock_folder
 from r3jax.formats.nerfstudio import read_transforms
 from r3jax.runs.reader import read_run
-from r3jax.simulators.start import APART
+from r3jax.simulators.clearance import APART
 
 VIEWS = 3
 

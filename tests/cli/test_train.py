@@ -10,7 +10,7 @@ from PIL import Image
 from r3jax.cli.main import main
 from r3jax.files import lock_folder
 from r3jax.geometry.cameras import Camera, look_at
-from r3jax.splatting.config import RasterConfig
+from r3jax.splatting.backend import RasterConfig
 from r3jax.splatting.ply import read_scene
 from r3jax.splatting.render import render
 from tests.splatting.clouds import random_cloud

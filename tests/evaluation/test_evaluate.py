@@ -12,11 +12,11 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from r3jax.evaluation import evaluate as evaluate_module
 from r3jax.evaluation.evaluate import evaluate
 from r3jax.evaluation.image_metrics import MAX_PSNR
-from r3jax.evaluation.maps import expected_image, expected_renderability, map_of
+from r3jax.evaluation.judge import expected_image, expected_renderability, map_of
 from r3jax.evaluation.scores import worst_rows
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, pose_along
-from r3jax.splatting.config import RasterConfig
+from r3jax.splatting.backend import RasterConfig
 from r3jax.splatting.render import render
 from r3jax.splatting.views import Views
 from tests.splatting.clouds import random_cloud, view
@@ -207,10 +207,10 @@ def test_a_map_knows_what_it_was_shown_and_no_more():
 
 @pytest.mark.full
 def test_a_map_grows_instead_of_dropping(monkeypatch):
-    from r3jax.evaluation import maps
+    from r3jax.evaluation import judge
 
-    small = maps.empty_map
-    monkeypatch.setattr(maps, "empty_map", lambda **given: small(256, **given))
+    small = judge.empty_map
+    monkeypatch.setattr(judge, "empty_map", lambda **given: small(256, **given))
     frames = frames_round(4)
     grown = map_of(frames, voxel_size=0.2)
     assert grown.capacity > 256

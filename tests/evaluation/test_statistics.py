@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r3jax.evaluation.statistics import mean_over_scenes, paired_difference
+from r3jax.evaluation.comparison import mean_over_scenes, paired_difference
 
 seeds = st.integers(0, 2**32 - 1)
 

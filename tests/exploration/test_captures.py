@@ -25,8 +25,7 @@ from r3jax.planning.turning import direction_of
 from r3jax.runs.begin import merge_runs
 from r3jax.runs.header import camera_fields, policy_fields
 from r3jax.runs.reader import read_run
-from r3jax.runs.reasons import explain_run
-from r3jax.runs.replay import differences, states_of
+from r3jax.runs.replay import differences, explain_run, states_of
 from r3jax.runs.rows import from_json, paths_to, to_json
 from r3jax.runs.writer import RunWriter
 from tests.exploration.killed_run import CONFIG, SCORING, small_policy

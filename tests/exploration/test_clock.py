@@ -6,16 +6,16 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from r3jax.exploration import clock
-from r3jax.exploration.clock import make_clock, timed
+from r3jax.exploration import state
 from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.state import make_clock, timed
 
 
 @pytest.fixture
 def ticking(monkeypatch):
     """Every look at the clock is one second later than the one before."""
     ticks = itertools.count()
-    monkeypatch.setattr(clock.time, "perf_counter", lambda: float(next(ticks)))
+    monkeypatch.setattr(state.time, "perf_counter", lambda: float(next(ticks)))
 
 
 def test_a_call_that_compiles_is_made_again_and_only_then_timed(ticking):

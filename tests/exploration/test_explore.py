@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r3jax.exploration import clock, explore
+from r3jax.exploration import explore, state
 from r3jax.exploration.config import ExplorationConfig, parse_budget
 from r3jax.exploration.state import StopReason
 from r3jax.mapping.occupancy import empty_grid, integrate_depth, mark_free_ball
@@ -139,7 +139,7 @@ def test_the_last_view_arrives_within_the_budget(budget):
 
 def test_only_planning_mapping_and_flight_are_on_the_wall_clock(monkeypatch):
     ticks = itertools.count()
-    monkeypatch.setattr(clock.time, "perf_counter", lambda: float(next(ticks)))
+    monkeypatch.setattr(state.time, "perf_counter", lambda: float(next(ticks)))
     config = replace(CONFIG, clock="wall")
     result = explore(BoxRoom(), Wander(), budget="views:4", config=config)
     # Every timed call lasts one tick: one for planning, one for mapping.

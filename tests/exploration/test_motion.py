@@ -17,7 +17,7 @@ from r3jax.geometry.cameras import pose_along
 from r3jax.planning.registry import make_policy
 from r3jax.planning.robot.motion import MOTIONS, Motion, motion_of_record
 from r3jax.runs.reader import read_run
-from r3jax.runs.reasons import explain_run
+from r3jax.runs.replay import explain_run
 from tests.cli.small_runs import main_without_report
 from tests.exploration.toys import BoxRoom
 

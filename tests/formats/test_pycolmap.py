@@ -7,8 +7,7 @@ import pytest
 
 from r3jax.formats.colmap.binary import read_binary, write_binary
 from r3jax.formats.colmap.model import ColmapModel, points_without_tracks, pose_of
-from r3jax.formats.colmap.quality import reconstruction_of
-from r3jax.formats.colmap.reader import read_colmap, read_model
+from r3jax.formats.colmap.reader import read_colmap, read_model, reconstruction_of
 from r3jax.formats.colmap.text import read_text, write_text
 from r3jax.formats.exports import posed_model
 from r3jax.formats.lenses import MODELS, Lens

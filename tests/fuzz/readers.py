@@ -25,7 +25,7 @@ from r3jax.apps.benchmark.reference_images import (
 )
 from r3jax.apps.benchmark.submitted import conditions_of
 from r3jax.apps.forecast.psnr import STATISTICS, read_calibration
-from r3jax.apps.report.model_report import (
+from r3jax.apps.report.report import (
     quality_note,
     quality_rows,
     read_evaluated_model,
@@ -71,7 +71,7 @@ from r3jax.runs.reader import read_run
 from r3jax.runs.rows import EndRow, to_json
 from r3jax.runs.stored_states import CheckpointWriter, load_checkpoint, map_tables, read_checkpoint
 from r3jax.runs.writer import encode_png
-from r3jax.simulators.habitat.stage import read_stage
+from r3jax.simulators.habitat import read_stage
 from r3jax.splatting.errors import CheckpointError, SceneFileError
 from r3jax.splatting.model import find_model
 from r3jax.splatting.ply import read_scene, write_scene

@@ -41,12 +41,6 @@ def test_nearest() -> None:
     assert lost.max() < 2e-6
 
 
-def test_angle() -> None:
-    bins = sphere.bins_for_angle
-    for angle, num in ((10.0, 526), (120.0, 4), (360.0, 1)):
-        assert bins(angle) == num
-
-
 def test_camera() -> None:
     camera = cameras.Camera(12, 8, 9.0, 11.0, 5.5, 4.25)
     depth = jnp.asarray(np.random.default_rng(0).uniform(0.3, 6.0, (8, 12)), jnp.float32)
@@ -84,10 +78,8 @@ def test_safe() -> None:
     assert float(numerics.safe_power(zero, zero + 2.0)) == 0.0
     np.testing.assert_allclose(numerics.safe_power(zero + 2.0, zero + 3.0), 8.0, rtol=1e-6)
     np.testing.assert_allclose(numerics.safe_norm(jnp.array([3.0, 4.0])), 5.0)
-    assert float(numerics.safe_divide(zero + 1.0, zero)) == 0.0
     gradients = [
         *jax.grad(numerics.safe_power, argnums=(0, 1))(zero, zero + 0.5),
-        *jax.grad(numerics.safe_divide, argnums=(0, 1))(zero + 1.0, zero),
         *jax.grad(numerics.safe_norm)(jnp.zeros(2)),
     ]
     assert np.isfinite(gradients).all()

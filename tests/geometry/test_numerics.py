@@ -7,17 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r3jax.geometry.numerics import safe_divide, safe_norm, safe_power
+from r3jax.geometry.numerics import safe_norm, safe_power
 
 positive = st.floats(2.0**-10, 1.0, width=32)
 exponents = st.floats(0.0, 4.0, width=32)
 
 norm = jax.jit(safe_norm)
 power = jax.jit(safe_power)
-divide = jax.jit(safe_divide)
 norm_gradient = jax.jit(jax.grad(safe_norm))
 power_gradient = jax.jit(jax.grad(safe_power, argnums=(0, 1)))
-divide_gradient = jax.jit(jax.grad(safe_divide, argnums=(0, 1)))
 
 
 @given(st.lists(st.floats(-100, 100, width=32), min_size=3, max_size=3))
@@ -54,17 +52,3 @@ def test_power_of_zero_has_a_value_and_finite_gradients(exponent, value):
     zero, exponent = jnp.float32(0.0), jnp.float32(exponent)
     assert float(power(zero, exponent)) == value
     assert np.isfinite(power_gradient(zero, exponent)).all()
-
-
-@given(st.floats(-10, 10, width=32), st.floats(0.125, 8, width=32), st.sampled_from([-1, 1]))
-def test_quotient_is_the_plain_quotient(numerator, size, sign):
-    denominator = sign * size
-    value = divide(jnp.float32(numerator), jnp.float32(denominator))
-    np.testing.assert_allclose(value, numerator / denominator, rtol=1e-5, atol=1e-30)
-
-
-def test_quotient_by_zero_is_zero_with_finite_gradients():
-    for numerator in (-1.0, 0.0, 2.0):
-        assert float(divide(jnp.float32(numerator), jnp.float32(0.0))) == 0.0
-        gradient = divide_gradient(jnp.float32(numerator), jnp.float32(0.0))
-        assert np.isfinite(gradient).all()

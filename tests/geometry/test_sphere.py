@@ -9,7 +9,6 @@ import pytest
 
 from r3jax.errors import InputError
 from r3jax.geometry.sphere import (
-    bins_for_angle,
     fibonacci_lattice,
     nearest_bin,
     octahedral_cell,
@@ -66,19 +65,6 @@ def test_lattice_is_nearly_even():
 def test_lattice_cannot_be_changed_by_its_users():
     with pytest.raises(ValueError, match="read-only"):
         fibonacci_lattice(64)[0, 0] = 2.0
-
-
-def test_ten_degrees_give_526_bins():
-    assert bins_for_angle(10.0) == bins_for_angle(10) == 526
-    assert bins_for_angle(120.0) == 4
-    assert bins_for_angle(180.0) == 2
-    assert bins_for_angle(360.0) == 1
-
-
-@pytest.mark.parametrize("angle", [0.0, -1.0, 361.0, float("nan")])
-def test_bad_angle_is_refused(angle):
-    with pytest.raises(ValueError, match="angle_deg"):
-        bins_for_angle(angle)
 
 
 def test_empty_lattice_is_refused():

@@ -24,7 +24,7 @@ from tests.plain_kernels import Modules, kernels_as_python, load
 WIDTH, HEIGHT, CAPACITY = 24, 40, 4096  # one shape: one compile; more rows than a block has
 CAMERA = Camera(WIDTH, HEIGHT, 40.0, 44.0, 11.0, 20.5)
 REACH = jnp.float32(3.0)
-CHAIN = tuple(f"r3jax.kernels.mapping.{name}" for name in ("bins", "mark", "group", "add"))
+CHAIN = tuple(f"r3jax.kernels.mapping.{name}" for name in ("bins", "mark", "add"))
 
 formulas = jax.jit(update._by_formulas)
 kernels = jax.jit(update._by_kernels)

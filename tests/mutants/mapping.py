@@ -26,9 +26,9 @@ MUTANTS = [
         ("jnp.sum(d * d, axis=0) * n_a * weight", "jnp.sum(d * d, axis=0) * weight"),
         ("m2_a + m2_b +", "m2_a +"),
         ("d = mean_b - mean_a", "d = mean_a - mean_b"),
-        ("at(state.visited) | new.visited", "new.visited"),
-        ("at(state.visited) | new.visited", "at(state.visited) ^ new.visited"),
-        ("jnp.maximum(at(state.resolution), new.resolution)", "new.resolution"),
+        ("bins | new.visited", "new.visited"),
+        ("bins | new.visited", "bins ^ new.visited"),
+        ("jnp.maximum(sharpness, new.resolution)", "new.resolution"),
     ),
     *faults(
         "r3jax/kernels/mapping/bins.py",
@@ -52,7 +52,7 @@ MUTANTS = [
         ("points = max(sums[i, 3], _ONE)", "points = _ONE"),
     ),
     *faults(
-        "r3jax/kernels/mapping/group.py",
+        "r3jax/kernels/mapping/add.py",
         "tests/mapping/test_kernels.py::test_laws_hold_for_the_kernels_as_python[law_add]",
         ("sums[group, 0] += rgb[j, 0]", "sums[group, 0] = rgb[j, 0]"),
         ("(depth <= reach) & ", ""),

@@ -34,21 +34,21 @@ MUTANTS = [
         ("above + (r >> 1) * stride", "above + r * stride"),
     ),
     *faults(
-        "r3jax/kernels/visibility/splat.py",
+        "r3jax/kernels/visibility/picture.py",
         "tests/scoring/test_kernel_faults.py::test_the_laws_hold[sums_agree]",
         ("spread = _QUARTER if begins_level else _ZERO", "spread = _ZERO"),
         ("(in_slants | is_own)", "is_own"),
         ("+ _TWO * _RING * level + _RING", "+ _RING"),
     ),
     *faults(
-        "r3jax/kernels/visibility/near.py",
+        "r3jax/kernels/visibility/bricks.py",
         "tests/scoring/test_kernel_faults.py::test_the_laws_hold[in_images]",
         ("= np.inf, np.nan", "= np.inf, np.inf"),
-        ("if is_valid[view]:", "if view == 0:"),
+        ("if is_valid[view]:\n            bounds", "if view == 0:\n            bounds"),
         ("_MARGIN = np.float32(4.0)", "_MARGIN = np.float32(-8.0)"),
     ),
     *faults(
-        "r3jax/kernels/visibility/limit.py",
+        "r3jax/kernels/visibility/seen.py",
         "tests/scoring/test_kernel_faults.py::test_the_laws_hold[sums_agree]",
         ("_flatter(before, after, np.float32(step))", "_ZERO"),
         ("return least if before * after > _ZERO else _ZERO", "return least"),
@@ -73,7 +73,7 @@ MUTANTS = [
     ),
     *faults(
         "r3jax/kernels/scoring/terms.py",
-        "tests/scoring/test_kernel_faults.py::test_the_laws_hold[terms_agree]",
+        "tests/scoring/test_kernel_faults.py::test_the_laws_hold[images_agree]",
         ("max(count - _ONE, _ONE)", "count"),
     ),
     *faults(
@@ -83,7 +83,7 @@ MUTANTS = [
     ),
     *faults(
         "r3jax/kernels/scoring/terms.py",
-        "tests/scoring/test_kernel_faults.py::test_the_laws_hold[terms_agree]",
+        "tests/scoring/test_kernel_faults.py::test_the_laws_hold[images_agree]",
         ("apart = _ZERO if cosine > _ZERO else _INFINITE", "apart = _ZERO"),
         ("-z * a_y, z * a_x", "-z * a_x, z * a_y"),
         ("kappa * (_ONE - bias)", "(_ONE - bias)"),
@@ -114,7 +114,7 @@ MUTANTS = [
         ("if row != last:", "if last < 0:"),
     ),
     *faults(
-        "r3jax/scoring/directions.py",
+        "r3jax/scoring/terms.py",
         "tests/scoring/test_laws.py::test_terms_follow_their_formulas",
         ("is_ahead = cosine > 0.0", "is_ahead = cosine > -0.5"),
         ("best = jnp.maximum(best, cosine)", "best = cosine"),

@@ -11,7 +11,7 @@ from r3jax.planning.registry import make_policy
 from r3jax.runs.begin import fork_run, merge_runs
 from r3jax.runs.header import RunError
 from r3jax.runs.reader import read_run
-from r3jax.runs.reasons import explain_run
+from r3jax.runs.replay import explain_run
 from r3jax.runs.settings import settings_of_run
 from tests.box_room import write_room
 from tests.cli import small_runs

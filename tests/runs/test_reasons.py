@@ -15,8 +15,7 @@ from r3jax.frame import Frame
 from r3jax.planning.registry import make_policy
 from r3jax.runs.header import RunError, camera_fields, plain_settings
 from r3jax.runs.reader import read_run
-from r3jax.runs.reasons import explain_run
-from r3jax.runs.replay import rebuild, states_of
+from r3jax.runs.replay import explain_run, rebuild, states_of
 from r3jax.runs.settings import planner_config_of
 from r3jax.runs.writer import RunWriter
 from tests.exploration.toys import UPPER, BoxRoom

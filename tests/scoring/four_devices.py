@@ -15,7 +15,7 @@ import r3jax
 from r3jax.geometry.cameras import Camera
 from r3jax.planning.candidates import poses_along
 from r3jax.planning.registry import make_policy
-from r3jax.scoring import batch, sharding
+from r3jax.scoring import batch
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.gather import gather_in_range
 from tests.planning.rooms import CELL, ORIGIN, center, grid_of, pose_at, two_rooms
@@ -75,12 +75,12 @@ def test_scores_are_those_of_one_device_bit_for_bit(scorer, candidates, one_devi
 
 def test_each_device_holds_a_share_and_the_whole_map(monkeypatch):
     given = []
-    kept = sharding._score
-    monkeypatch.setattr(sharding, "_score", lambda *a: given.append(a) or kept(*a))
+    kept = batch._score
+    monkeypatch.setattr(batch, "_score", lambda *a: given.append(a) or kept(*a))
     candidates, devices = jnp.asarray(poses()), jax.local_devices()
     voxels, cells, _ = gather_in_range(*flat(), candidates[:, :3, 3], CONFIG)
     known = (voxels, cells, CAMERA, CONFIG)
-    scores = sharding.score_on_devices(batch._score_views, known, candidates, devices)
+    scores = batch.score_on_devices(batch._score_views, known, candidates, devices)
     ((_, _, spread, shares),) = given
     for shared in (shares, *jax.tree.leaves(scores)):
         shards = sorted(shared.addressable_shards, key=lambda shard: shard.index[0].start)

@@ -12,14 +12,13 @@ from hypothesis import strategies as st
 import r3jax
 from r3jax.kernels.calls import Cells
 from r3jax.kernels.native import platform
-from r3jax.kernels.visibility.near import MAX_VIEWS
+from r3jax.kernels.visibility.bricks import MAX_VIEWS
 from r3jax.mapping.occupancy import OccupancyGrid, cells_of
 from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import poses_along
 from r3jax.scoring import backend, formulas
 from r3jax.scoring.config import scoring_config_of
 from r3jax.scoring.simulated import simulate_view_near
-from r3jax.scoring.terms import score_voxels
 from r3jax.visibility.views import View, panorama_view, pinhole_view
 
 CAPACITY = 1 << 12
@@ -198,29 +197,6 @@ def test_other_structs_of_xla_are_served_by_plain_jax(monkeypatch):
         found = jax.jit(asked_of(backend, "pinhole"))(state, cells_of(grid), poses_of(0)[0])
     expected = programs("pinhole")[0](state, cells_of(grid), poses_of(0)[:1])
     assert_same(found, jax.tree.map(lambda x: x[0], expected))
-
-
-@functools.cache
-def terms_of_rows():
-    """The formulas of one position and of several, then the backend's, and derivatives of both."""
-    focal, forms = CAMERA.focal, CONFIG.forms
-    exact = lambda m, at: score_voxels(m, at, focal, forms)
-    chosen = lambda m, at: backend.terms_of_rows(m, at, focal, forms)
-    total = lambda ask: jax.grad(lambda m, at: jnp.sum(ask(m, at).value), argnums=1)
-    return [jax.jit(jax.vmap(f, (None, 0))) for f in (exact, chosen, total(exact), total(chosen))]
-
-
-@settings(max_examples=8)
-@given(st.integers(0, 1000))
-def test_terms_of_all_rows_are_those_of_the_formulas(seed):
-    state, positions = world(seed)[0], poses_of(seed)[:, :3, 3]
-    exact, chosen, slope, found = terms_of_rows()
-    expected = exact(state, positions)
-    assert float(expected.value.max()) > 0.1
-    assert {1.0, 2.0} <= set(np.unique(expected.kappa))
-    for name, term in vars(chosen(state, positions)).items():
-        np.testing.assert_allclose(term, getattr(expected, name), atol=1e-4, err_msg=name)
-    np.testing.assert_allclose(found(state, positions), slope(state, positions), atol=1e-3)
 
 
 @pytest.mark.parametrize(

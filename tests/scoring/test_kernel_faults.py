@@ -14,7 +14,6 @@ import pytest
 from r3jax.kernels import calls
 from r3jax.mapping.occupancy import cells_of
 from r3jax.scoring import formulas
-from r3jax.scoring.terms import score_voxels
 from r3jax.visibility.views import for_kernels, layout_of, wrap
 from tests.mapping.test_kernels import arrays_of
 from tests.plain_kernels import Modules, kernels_as_python, load
@@ -28,8 +27,8 @@ from tests.scoring.test_backends import (
     world,
 )
 
-SIGHT = ("views", "picture", "splat", "limit", "seen", "bricks", "near")
-SCORES = ("terms", "voxels", "sums", "pixels", "rows", "changes")
+SIGHT = ("views", "picture", "seen", "bricks")
+SCORES = ("terms", "voxels", "sums", "pixels", "changes")
 CHAIN = (
     *(f"r3jax.kernels.visibility.{name}" for name in SIGHT),
     "r3jax.kernels.mapping.bins",
@@ -156,17 +155,6 @@ def points_lie_in_their_bricks(modules: Modules) -> None:
         np.testing.assert_array_equal(spheres, [[0.0, 0.0, 0.0, np.inf]])
 
 
-def terms_agree(modules: Modules) -> None:
-    state, _, rows, _ = asked()
-    position, focal = poses_of(2)[:1, :3, 3], np.float32([CAMERA.focal])
-    results = modules["rows"].Terms(*np.empty((6, 1, state.capacity), np.float32))
-    lattice = calls._lattice(state.num_bins)
-    modules["rows"].terms(rows, np.array(position), focal, forms_of(modules), lattice, 2, results)
-    terms = jax.jit(score_voxels)(state, position[0], CAMERA.focal)
-    for name, found in results._asdict().items():
-        np.testing.assert_allclose(found[0], getattr(terms, name), atol=1e-4, err_msg=name)
-
-
 def changes_agree(modules: Modules) -> None:
     (before, after), kept = known_after(2)
     positions, bins = poses_of(2)[:2, :3, 3], CONFIG.panorama_bins
@@ -189,7 +177,7 @@ def changes_agree(modules: Modules) -> None:
 
 LAWS = (
     borders_agree, points_lie_in_their_bricks, sums_agree, in_images, images_agree,
-    images_all_round, terms_agree, changes_agree,
+    images_all_round, changes_agree,
 )  # fmt: skip
 
 

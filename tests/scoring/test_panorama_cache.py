@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from r3jax.planning.candidates import poses_along
-from r3jax.scoring import batch, panorama_cache
+from r3jax.scoring import batch, panorama
 from r3jax.scoring.gather import gather_in_range
 from r3jax.scoring.simulated import simulate_view_near
 from tests.planning.known_hall import CAMERA, EYE, SCORING, for_scoring
@@ -79,7 +79,7 @@ def law_again(seed: int = 0, num: int = 2) -> None:
 
     @jax.jit
     def score(after, items):
-        one = lambda at: panorama_cache.panorama_from_cache(
+        one = lambda at: panorama.panorama_from_cache(
             at[0], start(), after, CAMERA, at[1], SCORING, at[2]
         )
         return jax.vmap(one)(items)

@@ -11,7 +11,7 @@ from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.geometry.voxels import pack
 from r3jax.mapping.join import Statistics, join
 from r3jax.mapping.update import observe_voxels
-from r3jax.scoring.directions import seen_directions
+from r3jax.scoring.terms import seen_directions
 
 CAPACITY = 4
 CENTER = jnp.full(3, 0.025)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from r3jax.simulators.clearance import APART, places_beside
 from r3jax.simulators.raycast.raycast import RaycastSimulator
-from r3jax.simulators.start import APART, places_beside
 from tests.simulators.rooms import SMALL, box_quads, box_room, facing_x, world_of
 
 PILLAR = ((4, 1, 0), (5.5, 3, 3))

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from r3jax.geometry.cameras import Camera, look_at
-from r3jax.splatting.config import RasterConfig
+from r3jax.splatting.backend import RasterConfig
 from r3jax.splatting.render import render
 from r3jax.splatting.scene import GaussianScene
 from r3jax.splatting.training.config import TrainConfig

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from r3jax.geometry.cameras import Camera, look_at
+from r3jax.splatting.backend import RasterConfig
 from r3jax.splatting.backends import reference
-from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.scene import GaussianScene
 
 _rasterize = jax.jit(reference.rasterize)

@@ -7,8 +7,8 @@ import pytest
 from scipy.special import sph_harm_y
 
 from r3jax.geometry.sphere import fibonacci_lattice
-from r3jax.splatting import harmonics as harmonics_module
-from r3jax.splatting.harmonics import harmonics, view_colors
+from r3jax.splatting import projection as harmonics_module
+from r3jax.splatting.projection import harmonics, view_colors
 
 NUM = 4096
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import r3jax.splatting.backend as backend_module
-from r3jax.splatting.config import RasterConfig, fitting_budget
+from r3jax.splatting.backend import RasterConfig
 from r3jax.splatting.render import render
 from r3jax.splatting.scene import GaussianScene, empty_scene
 from tests.splatting.clouds import random_cloud, safe_pixels, view
@@ -136,7 +136,15 @@ def test_auto_takes_numba_on_a_cpu():
 
 @pytest.mark.parametrize("needed", [1, 1000, 5000, 123_456, 3_000_000])
 def test_fitting_budgets_are_few_and_large_enough(needed):
-    budget = fitting_budget(needed)
+    budget = RasterConfig().with_room(needed).max_intersections
     assert max(1.2 * needed, 1000) <= budget <= max(1.6 * needed, 1300)
     # Slightly other needs fall on the same number: no new compilation.
-    assert len({fitting_budget(int(needed * f)) for f in np.linspace(0.9, 1.1, 9)}) <= 3
+    assert (
+        len(
+            {
+                RasterConfig().with_room(int(needed * f)).max_intersections
+                for f in np.linspace(0.9, 1.1, 9)
+            }
+        )
+        <= 3
+    )

@@ -25,7 +25,7 @@ from r3jax.planning.registry import make_policy, policy_class
 from r3jax.planning.robot.motion import Motion, make_motion, motion_of_record
 from r3jax.runs.header import plain_settings, settings_of
 from r3jax.scoring.config import RETIRED, ScoringConfig, scoring_config_of
-from r3jax.splatting.config import RasterConfig
+from r3jax.splatting.backend import RasterConfig
 from r3jax.splatting.training.config import TrainConfig
 
 IDENTITY_VERSION = 1

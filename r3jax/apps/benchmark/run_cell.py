@@ -31,7 +31,7 @@ from r3jax.apps.benchmark.reference_images import ReferenceImages, load_referenc
 from r3jax.apps.benchmark.submitted import load_submission, retake
 from r3jax.evaluation.evaluate import evaluate
 from r3jax.evaluation.image_metrics import load_lpips
-from r3jax.evaluation.maps import map_of
+from r3jax.evaluation.judge import map_of
 from r3jax.exploration.config import parse_budget
 from r3jax.exploration.loop import explore
 from r3jax.exploration.state import COMPLETE, StopReason

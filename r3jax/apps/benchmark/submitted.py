@@ -13,10 +13,10 @@ import numpy as np
 from r3jax.apps.benchmark.cells import OWN_OF_LOOP, Cell, Conditions
 from r3jax.apps.benchmark.plan import Request, prepare_scene
 from r3jax.errors import InputError
-from r3jax.exploration.clock import model_clock
 from r3jax.exploration.config import ExplorationConfig, format_budget, parse_budget
 from r3jax.exploration.coverage import measure_coverage, view_renderability
 from r3jax.exploration.guard import check_world
+from r3jax.exploration.state import model_clock
 from r3jax.exploration.taken_views import Choice, StepRow, frame_hash, stored_form
 from r3jax.files import make_folder
 from r3jax.formats.submissions import (

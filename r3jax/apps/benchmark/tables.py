@@ -11,10 +11,14 @@ import numpy as np
 from r3jax.errors import InputError
 from r3jax.evaluation.comparison import (
     Cell,
+    Estimate,
+    Scores,
     check_equal_terms,
     differing,
+    mean_over_scenes,
     method_name,
     methods_of,
+    paired_difference,
     scenes_of,
     scores_by_method,
     seeds_by_method,
@@ -25,7 +29,6 @@ from r3jax.evaluation.comparison import (
     with_short_names,
 )
 from r3jax.evaluation.scores import METRICS, POOR_PSNR, Metric
-from r3jax.evaluation.statistics import Estimate, Scores, mean_over_scenes, paired_difference
 
 FEWEST_SEEDS = 3
 """That the protocol asks for in each cell of a table."""

@@ -27,8 +27,7 @@ from r3jax.apps.forecast.psnr import Calibration, default_calibration, parse_goa
 from r3jax.errors import InputError
 from r3jax.exploration.config import ExplorationConfig
 from r3jax.exploration.state import LoopState
-from r3jax.geometry.axis_views import LOOKS, poses_at
-from r3jax.geometry.cameras import Camera
+from r3jax.geometry.cameras import LOOKS, Camera, poses_at
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.planning.planner import Planner

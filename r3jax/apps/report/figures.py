@@ -21,7 +21,7 @@ from r3jax.mapping.update import integrate_growing
 from r3jax.plots import style
 from r3jax.plots.pictures import floor_picture
 from r3jax.runs.reader import Run
-from r3jax.runs.reasons import explain_run
+from r3jax.runs.replay import explain_run
 from r3jax.runs.rows import paths_to
 from r3jax.scoring.explain import CAUSES
 from r3jax.scoring.renderability import renderability

@@ -33,7 +33,7 @@ from r3jax.runs.settings import (
 )
 from r3jax.runs.writer import RunWriter
 from r3jax.simulators.base import Simulator
-from r3jax.simulators.start import APART, places_beside
+from r3jax.simulators.clearance import APART, places_beside
 
 
 @dataclass(frozen=True)

@@ -28,11 +28,18 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from r3jax.errors import InputError
-from r3jax.exploration.clock import make_clock, timed
 from r3jax.exploration.config import Budget, ExplorationConfig, parse_budget
 from r3jax.exploration.guard import GuardedSimulator
 from r3jax.exploration.loop import Result
-from r3jax.exploration.state import LoopState, Mission, RecordingStopped, Stop, StopReason
+from r3jax.exploration.state import (
+    LoopState,
+    Mission,
+    RecordingStopped,
+    Stop,
+    StopReason,
+    make_clock,
+    timed,
+)
 from r3jax.exploration.step import relive, start_state, step
 from r3jax.exploration.taken_views import StepRow
 from r3jax.frame import Frame

@@ -16,7 +16,7 @@ from r3jax.apps.viewer.blocks import cut_height
 from r3jax.apps.viewer.canvas import Canvas
 from r3jax.apps.viewer.facts import PLACES, menu_of
 from r3jax.apps.viewer.panel import PANEL_WIDTH, Controls, Menu
-from r3jax.apps.viewer.preview import CameraPreview
+from r3jax.apps.viewer.pictures import CameraPreview
 from r3jax.apps.viewer.queries import Extras, Query, QueryHandler, Show
 from r3jax.apps.viewer.story import Story
 from r3jax.runs.header import RunError

@@ -19,8 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from r3jax.apps.viewer.color_maps import CAUSE_COLORS, UNSEEN, paint
-from r3jax.apps.viewer.preview import TERMS
+from r3jax.apps.viewer.pictures import CAUSE_COLORS, TERMS, UNSEEN, paint
 from r3jax.apps.viewer.story import Moment
 from r3jax.errors import InputError
 from r3jax.exploration.coverage import probe_poses
@@ -32,7 +31,7 @@ from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.seen import visible_rows
 from r3jax.mapping.state import MapState
 from r3jax.runs.header import RunHeader
-from r3jax.runs.reasons import Reason
+from r3jax.runs.replay import Reason
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.explain import CAUSES
 from r3jax.scoring.terms import score_voxels

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import viser
 
-from r3jax.apps.viewer.color_maps import linear_light, to_bytes
-from r3jax.apps.viewer.overlays import pose_of, quaternion
+from r3jax.apps.viewer.pictures import linear_light, pose_of, quaternion, to_bytes
 from r3jax.geometry.cameras import Camera, look_at
 
 _VIEW_COLOR = (120, 124, 134)

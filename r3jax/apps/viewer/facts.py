@@ -14,14 +14,23 @@ import numpy as np
 from PIL import Image
 
 from r3jax.apps.viewer.blocks import CAUSE
-from r3jax.apps.viewer.color_maps import ORDER, SCORES, UNSEEN, UTILITY_MAP, css_color, paint
-from r3jax.apps.viewer.preview import TERMS, CameraPreview, QuickPreview
+from r3jax.apps.viewer.pictures import (
+    ORDER,
+    SCORES,
+    TERMS,
+    UNSEEN,
+    UTILITY_MAP,
+    CameraPreview,
+    QuickPreview,
+    css_color,
+    paint,
+)
 from r3jax.apps.viewer.story import why_no_choice
 from r3jax.exploration.taken_views import Choice, StepRow
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.plots import style
 from r3jax.plots.page import data_url, render_macro
-from r3jax.runs.reasons import Reason
+from r3jax.runs.replay import Reason
 from r3jax.scoring.explain import CAUSES
 
 HINTS = {

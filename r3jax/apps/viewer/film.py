@@ -27,9 +27,8 @@ from r3jax.apps.viewer.blocks import (
     scoring_of,
     title_of,
 )
-from r3jax.apps.viewer.color_maps import SCORES, UNSEEN, css_color
 from r3jax.apps.viewer.facts import facts_of_view
-from r3jax.apps.viewer.overlays import frustum_segments, path_segments
+from r3jax.apps.viewer.pictures import SCORES, UNSEEN, css_color, frustum_segments, path_segments
 from r3jax.apps.viewer.story import Timeline
 from r3jax.exploration.taken_views import unit_of
 from r3jax.files import check_vacant, make_folder, whole_folder, write_atomic

@@ -26,7 +26,6 @@ from r3jax.apps.viewer.blocks import (
     surface_terms,
 )
 from r3jax.apps.viewer.canvas import Canvas, Color
-from r3jax.apps.viewer.color_maps import CAUSE_COLORS, paint, to_bytes
 from r3jax.apps.viewer.facts import (
     PLACES,
     Caption,
@@ -35,23 +34,27 @@ from r3jax.apps.viewer.facts import (
     preview_html,
     view_html,
 )
-from r3jax.apps.viewer.overlays import path_segments, splat_arrays
 from r3jax.apps.viewer.panel import Controls, DisplaySettings
-from r3jax.apps.viewer.preview import (
+from r3jax.apps.viewer.pictures import (
+    CAUSE_COLORS,
     CameraPreview,
     Context,
     QuickPreview,
+    paint,
     panorama_image,
+    path_segments,
     preview_from,
     preview_pictures,
     quick_preview_from,
     quick_preview_image,
+    splat_arrays,
+    to_bytes,
 )
 from r3jax.apps.viewer.story import Moment, Offer, Story, offer_segments
 from r3jax.exploration.taken_views import name_of, unit_of
 from r3jax.geometry.cameras import Camera
 from r3jax.runs.header import RunError
-from r3jax.runs.reasons import Reason
+from r3jax.runs.replay import Reason
 from r3jax.scoring.config import ScoringConfig
 from r3jax.splatting.scene import GaussianScene
 from r3jax.splatting.views import fitted_size

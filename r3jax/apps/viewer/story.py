@@ -17,12 +17,10 @@ from typing import Protocol, runtime_checkable
 import jax
 import numpy as np
 
-from r3jax.apps.viewer.color_maps import UTILITY_MAP, paint, spread
-from r3jax.apps.viewer.overlays import frustum_segments
-from r3jax.exploration.clock import model_clock
+from r3jax.apps.viewer.pictures import UTILITY_MAP, frustum_segments, paint, spread
 from r3jax.exploration.config import ExplorationConfig, parse_budget
 from r3jax.exploration.guard import GuardedSimulator
-from r3jax.exploration.state import Mission
+from r3jax.exploration.state import Mission, model_clock
 from r3jax.exploration.step import relive, start_state
 from r3jax.exploration.taken_views import StepRow, TakenView
 from r3jax.frame import Frame
@@ -33,8 +31,7 @@ from r3jax.planning.planner import Planner, add_frame, first_map
 from r3jax.planning.policy import Decision, Policy
 from r3jax.runs.header import RunError
 from r3jax.runs.reader import Run
-from r3jax.runs.reasons import Reason, explain_run
-from r3jax.runs.replay import check_decided_alone, grid_before
+from r3jax.runs.replay import Reason, check_decided_alone, explain_run, grid_before
 from r3jax.runs.settings import config_of
 
 

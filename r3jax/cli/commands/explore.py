@@ -108,14 +108,14 @@ def _open_page(options: PageOptions, stack: contextlib.ExitStack) -> Callable[[E
     """Opens a server for a page that will show an expedition; the stack closes it.
 
     Returns:
-        Makes the `viewer.live.LiveFeed` of the expedition, once there is one.
+        Makes the `viewer.pages.LiveFeed` of the expedition, once there is one.
 
     Raises:
         InputError: viser is not installed.
         OSError: the port is in use.
     """
     check_viser()
-    from r3jax.apps.viewer.live import open_live
+    from r3jax.apps.viewer.pages import open_live
     from r3jax.apps.viewer.server import close_server, open_server
 
     server = open_server("127.0.0.1", options.port)

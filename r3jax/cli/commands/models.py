@@ -25,7 +25,7 @@ from r3jax.formats.captures import open_capture
 from r3jax.formats.points import write_points
 from r3jax.formats.ros.bags import parse_topics
 from r3jax.runs.header import package_versions
-from r3jax.splatting.config import RasterConfig
+from r3jax.splatting.backend import RasterConfig
 from r3jax.splatting.errors import TrainingDiverged
 from r3jax.splatting.model import check_free, find_model, only_writer, scene_points, write_model
 from r3jax.splatting.training import train

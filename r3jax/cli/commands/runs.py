@@ -292,7 +292,7 @@ def _show_page(options: ViewOptions, run: Run, console: Console) -> None:
         ValueError, OSError: as `open_run_page`.
     """
     check_viser()
-    from r3jax.apps.viewer.recorded import open_run_page  # needs viser
+    from r3jax.apps.viewer.pages import open_run_page  # needs viser
 
     if warning := exposure_warning(options.host, "sees the page, and can use it"):
         console.say(warning, style="yellow")

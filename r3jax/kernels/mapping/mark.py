@@ -1,4 +1,8 @@
-"""Finds visible voxels and their direction bins: `mapping.seen` in machine code."""
+"""Voxels in a frame's view: `mapping.seen` and `mapping.moved.count_misses` in machine code.
+
+`map_mark` sets the direction bins of voxels that the frame shows, `map_miss` removes those that it
+sees through.
+"""
 
 # Kernels have the types that Numba infers where they are called; annotations it would not read.
 # pyright: reportMissingParameterType=false, reportUnknownParameterType=false
@@ -9,6 +13,7 @@ import numpy as np
 from numba import prange
 
 from r3jax.geometry.voxels import EMPTY_WORD
+from r3jax.kernels import constants
 from r3jax.kernels.mapping.bins import camera_of, center_of, is_valid, mark_rows
 from r3jax.kernels.native.arithmetic import whole
 from r3jax.kernels.native.compiled import (
@@ -20,8 +25,14 @@ from r3jax.kernels.native.compiled import (
     prefetch,
 )
 
-BLOCK = 1 << 12
-"""Number of rows that a worker takes at a time."""
+_FEW = np.float32(constants.FEW_OBSERVATIONS)
+_SLACK, _NOISE = np.float32(constants.SLACK_EDGES), np.float32(constants.SLACK_NOISE)
+_HALF_DIAGONAL = np.float32(constants.HALF_DIAGONAL)
+_SHARE, _LEAST = np.float32(constants.NEAR_ENOUGH), np.float32(constants.LEAST_FOOTPRINT)
+
+
+_BLOCK = 1 << 12
+"""Rows that a worker looks at before it takes the next."""
 
 _AHEAD = 16
 """Prefetch distance [rows]: their pixels lie anywhere in memory."""
@@ -51,7 +62,7 @@ def _farthest_around(depth, row, column):
 
 
 @inlined_fused
-def project(key, first, num, frame, voxel_size, pixels, depths):
+def _project(key, first, num, frame, voxel_size, pixels, depths):
     """Projects each row from `first` on to its pixel and z-depth; -1 out of the image or range.
 
     There is no branch, so that LLVM turns the loop into vectors: most rows end here.
@@ -81,6 +92,18 @@ def project(key, first, num, frame, voxel_size, pixels, depths):
 
 
 @inlined_fused
+def _list_in_view(key, first, num, frame, voxel_size, pixels, depths, seen):
+    """Projects rows from `first` on and lists those in view in `seen`; returns their number."""
+    _project(key, first, num, frame, voxel_size, pixels, depths)
+    # Without a branch: whether a row is in view is often mispredicted.
+    count = 0
+    for i in range(num):
+        seen[count] = i
+        count += pixels[i] >= 0
+    return count
+
+
+@inlined_fused
 def _is_shown(pixel, measured, z, depth, slack, is_visible):
     """Checks whether a frame shows a row that lies in one of its pixels."""
     if measured == _ZERO:
@@ -96,7 +119,7 @@ def _is_shown(pixel, measured, z, depth, slack, is_visible):
 
 
 @inlined
-def is_camera(frame, camera):
+def _is_camera(frame, camera):
     """Checks that the intrinsics and the pose are valid."""
     total = frame.fx + frame.fy + frame.cx + frame.cy
     for axis in range(3):
@@ -121,25 +144,20 @@ def map_mark(visited, resolution, key, voxel_size, frame, is_visible, bins, latt
         workers: threads.
     """
     camera = camera_of(frame, voxel_size)
-    if is_camera(frame, camera):
+    if _is_camera(frame, camera):
         _mark_all(visited, resolution, key, camera, frame, is_visible, bins, lattice, workers)
 
 
 @parallel_kernel
 def _mark_all(visited, resolution, key, camera, frame, is_visible, bins, lattice, workers):
     depth, voxel_size, capacity = frame.depth, camera.voxel_size, key.shape[1]
-    flat, blocks = depth.reshape(depth.size), (capacity + BLOCK - 1) // BLOCK
+    flat, blocks = depth.reshape(depth.size), (capacity + _BLOCK - 1) // _BLOCK
     for worker in prange(workers):
-        pixels, depths = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.float32)
-        seen, shown = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int64)
+        pixels, depths = np.empty(_BLOCK, np.int32), np.empty(_BLOCK, np.float32)
+        seen, shown = np.empty(_BLOCK, np.int32), np.empty(_BLOCK, np.int64)
         for block in range(worker, blocks, workers):
-            first, size = block * BLOCK, min(BLOCK, capacity - block * BLOCK)
-            project(key, first, size, frame, voxel_size, pixels, depths)
-            # Listed without a branch: whether a row is in view is often mispredicted.
-            num = 0
-            for i in range(size):
-                seen[num] = i
-                num += pixels[i] >= 0
+            first, size = block * _BLOCK, min(_BLOCK, capacity - block * _BLOCK)
+            num = _list_in_view(key, first, size, frame, voxel_size, pixels, depths, seen)
             count = 0
             for k in range(num):
                 if k + _AHEAD < num:
@@ -151,3 +169,76 @@ def _mark_all(visited, resolution, key, camera, frame, is_visible, bins, lattice
                     pixel, flat[pixel], depths[i], depth, voxel_size, is_visible[first + i] != 0
                 )
             mark_rows(key, visited, resolution, shown, count, camera, bins, lattice)
+
+
+@inlined_fused
+def _is_open(depth, pixel, z, focal, size, limit):
+    """Checks whether all pixels of a voxel's footprint measure something beyond a limit."""
+    height, width = depth.shape
+    half = np.int64(math.ceil(focal * _HALF_DIAGONAL * size / z)) + 1
+    row, column = pixel // width, pixel % width
+    if half > constants.MOST_HALF or row < half or column < half:
+        return False
+    if row + half >= height or column + half >= width:
+        return False
+    for i in range(row - half, row + half + 1):
+        for j in range(column - half, column + half + 1):
+            if not depth[i, j] > limit:
+                return False
+    return True
+
+
+@kernel
+def map_miss(counts, m2, mean, misses, key, resolution, voxel_size, frame, workers):
+    """Counts looks through each voxel, and removes those that were looked through often, in place.
+
+    Args:
+        counts: observations of each row [N].
+        m2: spread of the colors [N].
+        mean: colors [3, N].
+        misses: looks through each row since it was last measured [N].
+        key: of the map [2, N].
+        resolution: best so far [N].
+        voxel_size: edge [m].
+        frame: `calls.FrameArrays`.
+        workers: threads.
+    """
+    camera = camera_of(frame, voxel_size)
+    if _is_camera(frame, camera):
+        _miss_all(counts, m2, mean, misses, key, resolution, voxel_size, frame, workers)
+
+
+@parallel_kernel
+def _miss_all(counts, m2, mean, misses, key, resolution, size, frame, workers):
+    depth, capacity = frame.depth, key.shape[1]
+    flat, blocks = depth.reshape(depth.size), (capacity + _BLOCK - 1) // _BLOCK
+    focal = max(frame.fx, frame.fy)
+    for worker in prange(workers):
+        pixels, depths = np.empty(_BLOCK, np.int32), np.empty(_BLOCK, np.float32)
+        seen = np.empty(_BLOCK, np.int32)
+        for block in range(worker, blocks, workers):
+            first, many = block * _BLOCK, min(_BLOCK, capacity - block * _BLOCK)
+            num = _list_in_view(key, first, many, frame, size, pixels, depths, seen)
+            for k in range(num):
+                i = np.int64(seen[k])
+                row, z, pixel = first + i, depths[i], np.int64(pixels[i])
+                slack = _SLACK * size + _NOISE * z
+                measured = flat[pixel]
+                if measured == _ZERO or measured < z - slack or counts[row] == _ZERO:
+                    continue
+                if measured <= z + slack:
+                    misses[row] = 0
+                    continue
+                sharpness = frame.focal / z
+                if sharpness < _SHARE * resolution[row] or sharpness * size < _LEAST:
+                    continue
+                if not _is_open(depth, pixel, z, focal, size, z + slack):
+                    continue
+                misses[row] += 1
+                if misses[row] >= (
+                    constants.MISSES_OF_FEW if counts[row] <= _FEW else constants.MISSES
+                ):
+                    misses[row] = 0
+                    counts[row], m2[row] = _ZERO, _ZERO
+                    for channel in range(3):
+                        mean[channel, row] = _ZERO

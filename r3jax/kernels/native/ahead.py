@@ -16,8 +16,10 @@ from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 
-COMPILER = "r3jax.cli.kernels"
-"""What the process runs; it knows all kernels."""
+from r3jax.files import make_folder, write_atomic
+
+COMPILER = "r3jax.kernels.native.ahead"
+"""This module, which the process runs: `python -m r3jax.kernels.native.ahead NOTE`."""
 
 _PACKAGE = Path(__file__).parents[2]
 
@@ -60,3 +62,20 @@ def _note_in(cache: Path) -> Path:
     parts = [f"{path} {path.stat().st_mtime_ns}" for path in sources]
     parts += [version("numba"), version("jaxlib"), platform.python_version(), platform.node()]
     return cache / hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+
+
+def main(note: Path) -> None:
+    """Compiles all kernels but rare ones, and leaves a note."""
+    from r3jax.kernels import bridge
+
+    for name in bridge.HANDLERS:
+        if name not in bridge.RARE:
+            bridge.register(name)
+    make_folder(note.parent)
+    write_atomic(note, b"")
+
+
+if __name__ == "__main__":
+    if hasattr(os, "nice"):  # Windows has no such thing
+        os.nice(5)  # the command itself goes first
+    main(Path(sys.argv[1]))

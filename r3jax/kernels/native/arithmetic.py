@@ -219,18 +219,6 @@ def key_of(typingctx, distance, row):
     return types.int64(types.float32, types.int32), codegen
 
 
-@intrinsic
-def distance_of(typingctx, key):
-    """Extracts the distance from a key."""
-    long = ir.IntType(64)
-
-    def codegen(context, builder, sig, args):
-        high = builder.lshr(args[0], ir.Constant(long, 32))
-        return builder.bitcast(builder.trunc(high, _INT), _FLOAT)
-
-    return types.float32(types.int64), codegen
-
-
 _ROUND = np.float32(12582912.0)  # 1.5 * 2^23: adding it leaves the rounded integer in the low bits
 _LOWEST = np.float32(-126.0)
 _E0, _E1 = np.float32(1.0), np.float32(6.931469440460205e-1)  # 2^0 is exactly 1

@@ -118,11 +118,33 @@ def float0(frame, kind, index):
     return carray(_floats(_int64_at(_buffer(frame, kind, index) + _DATA)), (1,))[0]
 
 
-@inlined
-def floats1(frame, kind, index):
-    """Views the index-th argument or result as float32 with one axis."""
-    buffer = _buffer(frame, kind, index)
-    return carray(_floats(_int64_at(buffer + _DATA)), (_length(buffer, 0),))
+def _viewers(cast):
+    """Makes functions that view the index-th argument or result of a call, with 1, 2 or 3 axes."""
+
+    @inlined
+    def view1(frame, kind, index):
+        buffer = _buffer(frame, kind, index)
+        return carray(cast(_int64_at(buffer + _DATA)), (_length(buffer, 0),))
+
+    @inlined
+    def view2(frame, kind, index):
+        buffer = _buffer(frame, kind, index)
+        shape = _length(buffer, 0), _length(buffer, 1)
+        return carray(cast(_int64_at(buffer + _DATA)), shape)
+
+    @inlined
+    def view3(frame, kind, index):
+        buffer = _buffer(frame, kind, index)
+        shape = _length(buffer, 0), _length(buffer, 1), _length(buffer, 2)
+        return carray(cast(_int64_at(buffer + _DATA)), shape)
+
+    return view1, view2, view3
+
+
+floats1, floats2, floats3 = _viewers(_floats)
+ints1, ints2, _ = _viewers(_ints)
+bytes1, bytes2, _ = _viewers(_bytes)
+_, words2, _ = _viewers(_words)
 
 
 @inlined
@@ -133,60 +155,6 @@ def floats_flat(frame, kind, index):
     for axis in range(_int64_at(buffer + _RANK)):
         size *= _length(buffer, axis)
     return carray(_floats(_int64_at(buffer + _DATA)), (size,))
-
-
-@inlined
-def floats2(frame, kind, index):
-    """Views the index-th argument or result as float32 with two axes."""
-    buffer = _buffer(frame, kind, index)
-    shape = _length(buffer, 0), _length(buffer, 1)
-    return carray(_floats(_int64_at(buffer + _DATA)), shape)
-
-
-@inlined
-def floats3(frame, kind, index):
-    """Views the index-th argument or result as float32 with three axes."""
-    buffer = _buffer(frame, kind, index)
-    shape = _length(buffer, 0), _length(buffer, 1), _length(buffer, 2)
-    return carray(_floats(_int64_at(buffer + _DATA)), shape)
-
-
-@inlined
-def ints1(frame, kind, index):
-    """Views the index-th argument or result as int32 with one axis."""
-    buffer = _buffer(frame, kind, index)
-    return carray(_ints(_int64_at(buffer + _DATA)), (_length(buffer, 0),))
-
-
-@inlined
-def bytes2(frame, kind, index):
-    """Views the index-th argument or result as uint8 with two axes."""
-    buffer = _buffer(frame, kind, index)
-    shape = _length(buffer, 0), _length(buffer, 1)
-    return carray(_bytes(_int64_at(buffer + _DATA)), shape)
-
-
-@inlined
-def ints2(frame, kind, index):
-    """Views the index-th argument or result as int32 with two axes."""
-    buffer = _buffer(frame, kind, index)
-    shape = _length(buffer, 0), _length(buffer, 1)
-    return carray(_ints(_int64_at(buffer + _DATA)), shape)
-
-
-@inlined
-def words2(frame, kind, index):
-    """Views the index-th argument or result as uint32 with two axes."""
-    buffer = _buffer(frame, kind, index)
-    shape = _length(buffer, 0), _length(buffer, 1)
-    return carray(_words(_int64_at(buffer + _DATA)), shape)
-
-
-@inlined
-def bytes1(frame, kind, index):
-    """Views the index-th argument or result as uint8 with one axis."""
-    buffer = _buffer(frame, kind, index)
-    return carray(_bytes(_int64_at(buffer + _DATA)), (_length(buffer, 0),))
 
 
 @called_from_python(parallel=True)

@@ -26,13 +26,15 @@ from r3jax.kernels.scoring.terms import (
 from r3jax.kernels.scoring.voxels import bins_of
 from r3jax.kernels.visibility.bricks import find_runs, sorted_slots
 from r3jax.kernels.visibility.picture import (
+    SPARE,
+    TARGETS,
     begin_of,
+    find_targets,
     push_down,
     pyramid_size,
     side_of,
     stride_of,
 )
-from r3jax.kernels.visibility.splat import SPARE, TARGETS, find_targets
 from r3jax.kernels.visibility.views import CHUNK, DISTANCE, PLACED, place, sound_views, view_at
 
 _NOTHING = np.int64(2**63 - 1)

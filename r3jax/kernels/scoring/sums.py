@@ -41,20 +41,27 @@ from r3jax.kernels.scoring.voxels import (
     near_voxels,
     sorted_voxels,
 )
-from r3jax.kernels.visibility.bricks import find_runs, sorted_points
-from r3jax.kernels.visibility.limit import padded_size, surface_limit
-from r3jax.kernels.visibility.near import MAX_VIEWS, bricks_of_shares, compact, mark_near
+from r3jax.kernels.visibility.bricks import (
+    MAX_VIEWS,
+    bricks_of_shares,
+    compact,
+    find_runs,
+    mark_near,
+    sorted_points,
+)
 from r3jax.kernels.visibility.picture import (
+    SPARE,
+    TARGETS,
     begin_of,
     fill_ring,
+    find_targets,
     picture_size,
     push_down,
     pyramid_size,
     side_of,
     stride_of,
 )
-from r3jax.kernels.visibility.seen import test_corners, test_points
-from r3jax.kernels.visibility.splat import SPARE, TARGETS, find_targets
+from r3jax.kernels.visibility.seen import padded_size, surface_limit, test_corners, test_points
 from r3jax.kernels.visibility.views import CHUNK, DISTANCE, PLACED, place, sound_views, view_at
 
 _ZERO, _ONE, _LEAST = np.float32(0.0), np.float32(1.0), np.float32(1e-6)

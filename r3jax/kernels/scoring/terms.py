@@ -1,4 +1,4 @@
-"""R of a voxel: the formulas of `scoring.terms` and `scoring.directions`.
+"""R of a voxel: the formulas of `scoring.terms`.
 
     R = cos^kappa  delta^(kappa (1 - b))  min(1, rho_max / rho)^(1 - delta b)
 

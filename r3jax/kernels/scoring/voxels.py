@@ -12,8 +12,7 @@ from r3jax.kernels.mapping.bins import center_of, center_of_words
 from r3jax.kernels.native.arithmetic import bits_of, count_bits, float_of
 from r3jax.kernels.native.compiled import in_wide_vectors, inlined, kernel, parallel_kernel
 from r3jax.kernels.scoring.terms import consistency, log2_or_never
-from r3jax.kernels.visibility.bricks import sorted_slots
-from r3jax.kernels.visibility.near import bricks_of_shares, compact, mark_near
+from r3jax.kernels.visibility.bricks import bricks_of_shares, compact, mark_near, sorted_slots
 from r3jax.kernels.visibility.views import CHUNK
 
 _ZERO = np.float32(0.0)

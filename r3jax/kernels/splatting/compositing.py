@@ -167,11 +167,73 @@ def composite_all(records, list_ids, list_rows, tile_starts, workers, rgb, depth
             tile = claim(next_tile)
 
 
+def over_lists(planes, slot_size, read_tile, no_sums, add_row, store_sums):
+    """Makes a kernel that goes through the lists of all tiles once more, as the forward pass did.
+
+    It sums up numbers of each intersection over the pixels of a tile, and writes them to its slot;
+    slots of a Gaussian lie side by side.
+
+    Args:
+        planes: numbers of each pixel in the state of a tile; the transmittance comes first.
+        slot_size: floats of an intersection.
+        read_tile: lays out the state, with transmittance 1.
+        no_sums: returns the sums of no pixels.
+        add_row: adds a row of pixels: place in the state, distance from the center, alpha before
+            it was cut off and after, transmittance in front, weight.
+        store_sums: adds up the lanes, and writes them to a slot.
+    """
+
+    @kernel
+    def of_tile(
+        first, last, left, top, records, list_ids, list_slots, list_rows, inputs, state, slots
+    ):
+        flat = records.reshape(-1)
+        lanes = lane_numbers()
+        for place in range(first, last):
+            if place + AHEAD < last:
+                prefetch(flat, list_ids[place + AHEAD] * at.SIZE)
+            record = records[list_ids[place]]
+            dx, across, slant, y = in_tile(record, left, top, lanes)
+            sums = no_sums()
+            rows = list_rows[place]
+            for row in range(rows & 15, (rows >> 4) + 1):
+                k, dy = TILE * row, y - np.float32(row)
+                free = alpha_in_row(record, dx, across, slant, dy)
+                alpha = smaller(free, splat(ALPHA_MAX))
+                before = load(state, k)
+                weight = take_light(k, alpha, state)
+                pixels = k, dy, free, alpha, before, weight
+                sums = add_row(record, pixels, inputs, state, sums)
+            store_sums(sums, dx, slots, list_slots[place] * slot_size)
+
+    @parallel_kernel
+    def of_all(lists, records, inputs, size, workers, slots):
+        list_ids, list_slots, list_rows, tile_starts, tile_ends = lists
+        columns = -(-size[0] // TILE)
+        next_tile = np.zeros(1, np.int64)
+        for _ in prange(workers):
+            state = np.empty(planes * PIXELS, np.float32)
+            tile = claim(next_tile)
+            while tile < tile_ends.shape[0]:
+                left, top = tile % columns * TILE, tile // columns * TILE
+                read_tile(left, top, inputs, state)
+                end = tile_ends[tile]
+                of_tile(
+                    tile_starts[tile], end, left, top,
+                    records, list_ids, list_slots, list_rows, inputs, state, slots,
+                )  # fmt: skip
+                for place in range(end, tile_starts[tile + 1]):  # hidden behind the rest
+                    slot = list_slots[place] * slot_size
+                    slots[slot : slot + slot_size] = _ZERO
+                tile = claim(next_tile)
+
+    return of_all
+
+
 @inlined
-def _read_tile(left, top, images, gradients, state):
+def _read_gradients(left, top, inputs, state):
     """Lays out a tile: transmittance 1, the pixel's total, and the five gradients of the images."""
-    rgb, depth, alpha = images
-    g_rgb, g_depth, g_alpha = gradients
+    rgb, depth, alpha, g_rgb, g_depth, g_alpha = inputs
     state[:PIXELS] = _ONE
     state[PIXELS:] = _ZERO
     for y in range(min(TILE, alpha.shape[0] - top)):
@@ -205,61 +267,38 @@ def gradient_by_alpha(k, free, alpha, weight, q, state):
     return keep_ge(keep_gt(v, weight, _ZERO), ALPHA_MAX, free)
 
 
-@kernel
-def _gradient_of_tile(
-    first, last, left, top, records, list_ids, list_slots, list_rows, state, slots
-):
-    """Writes the gradients of a tile's intersections to their slots."""
-    flat = records.reshape(-1)
-    lanes = lane_numbers()
+@inlined
+def _no_gradients():
     zero = splat(_ZERO)
-    for place in range(first, last):
-        if place + AHEAD < last:
-            prefetch(flat, list_ids[place + AHEAD] * at.SIZE)
-        record = records[list_ids[place]]
-        dx, across, slant, y = in_tile(record, left, top, lanes)
-        v0, v1, v2 = zero, zero, zero
-        red, green, blue, depth = zero, zero, zero, zero
-        rows = list_rows[place]
-        for row in range(rows & 15, (rows >> 4) + 1):
-            k = TILE * row
-            dy = y - np.float32(row)
-            free = alpha_in_row(record, dx, across, slant, dy)
-            alpha = smaller(free, splat(ALPHA_MAX))
-            weight = take_light(k, alpha, state)
-            g_red, g_green = load(state, 2 * PIXELS + k), load(state, 3 * PIXELS + k)
-            g_blue, g_depth = load(state, 4 * PIXELS + k), load(state, 5 * PIXELS + k)
-            q = fma(g_red, record[at.RED], load(state, 6 * PIXELS + k))
-            q = fma(g_green, record[at.GREEN], q)
-            q = fma(g_blue, record[at.BLUE], q)
-            q = fma(g_depth, record[at.DEPTH], q)
-            v = gradient_by_alpha(k, free, alpha, weight, q, state)
-            v_dy = v * dy
-            v0, v1, v2 = v0 + v, v1 + v_dy, fma(v_dy, dy, v2)
-            red, green = fma(weight, g_red, red), fma(weight, g_green, green)
-            blue, depth = fma(weight, g_blue, blue), fma(weight, g_depth, depth)
-        v_dx = v0 * dx
-        sums = sums_of_10(v0, v_dx, v_dx * dx, v1, v1 * dx, v2, red, green, blue, depth)
-        store12(slots, list_slots[place] * at.GRADIENT_SIZE, sums)
+    return zero, zero, zero, zero, zero, zero, zero
 
 
-@parallel_kernel
-def gradient_of_all(lists, records, images, gradients, workers, slots):
-    """Computes the gradients of all intersections, those of a Gaussian side by side."""
-    list_ids, list_slots, list_rows, tile_starts, tile_ends = lists
-    columns = -(-images[2].shape[1] // TILE)
-    next_tile = np.zeros(1, np.int64)
-    for _ in prange(workers):
-        state = np.empty(7 * PIXELS, np.float32)
-        tile = claim(next_tile)
-        while tile < tile_ends.shape[0]:
-            left, top = tile % columns * TILE, tile // columns * TILE
-            _read_tile(left, top, images, gradients, state)
-            end = tile_ends[tile]
-            _gradient_of_tile(
-                tile_starts[tile], end, left, top,
-                records, list_ids, list_slots, list_rows, state, slots,
-            )  # fmt: skip
-            for place in range(end, tile_starts[tile + 1]):  # hidden behind the rest
-                store12(slots, list_slots[place] * at.GRADIENT_SIZE, splat(_ZERO))
-            tile = claim(next_tile)
+@inlined
+def _add_gradients(record, pixels, inputs, state, sums):
+    """Adds v, v dy, v dy^2, and the gradients by color and depth."""
+    k, dy, free, alpha, _, weight = pixels
+    v0, v1, v2, red, green, blue, depth = sums
+    g_red, g_green = load(state, 2 * PIXELS + k), load(state, 3 * PIXELS + k)
+    g_blue, g_depth = load(state, 4 * PIXELS + k), load(state, 5 * PIXELS + k)
+    q = fma(g_red, record[at.RED], load(state, 6 * PIXELS + k))
+    q = fma(g_green, record[at.GREEN], q)
+    q = fma(g_blue, record[at.BLUE], q)
+    q = fma(g_depth, record[at.DEPTH], q)
+    v = gradient_by_alpha(k, free, alpha, weight, q, state)
+    v_dy = v * dy
+    red, green = fma(weight, g_red, red), fma(weight, g_green, green)
+    blue, depth = fma(weight, g_blue, blue), fma(weight, g_depth, depth)
+    return v0 + v, v1 + v_dy, fma(v_dy, dy, v2), red, green, blue, depth
+
+
+@inlined
+def _store_gradients(sums, dx, slots, slot):
+    v0, v1, v2, red, green, blue, depth = sums
+    v_dx = v0 * dx
+    store12(slots, slot, sums_of_10(v0, v_dx, v_dx * dx, v1, v1 * dx, v2, red, green, blue, depth))
+
+
+gradient_of_all = over_lists(
+    7, at.GRADIENT_SIZE, _read_gradients, _no_gradients, _add_gradients, _store_gradients
+)
+"""Computes the gradients of all intersections; takes the images and the gradients by them."""

@@ -11,14 +11,15 @@ from numba import prange
 
 from r3jax.kernels.native.compiled import claim, inlined_fast, kernel, parallel_kernel
 from r3jax.kernels.splatting import records as at
-from r3jax.kernels.splatting.harmonics import basis_at, gradient_by_direction
 from r3jax.kernels.splatting.project import (
     ONE,
     TWO,
     ZERO,
+    basis_at,
     clamped_slope,
     covariance_of,
     direction_of,
+    gradient_by_direction,
     image_axes,
     in_camera,
     jacobian_rows,

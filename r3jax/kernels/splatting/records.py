@@ -2,7 +2,7 @@
 
 Lengths are pixels. The conic is halved and in units of log 2, so that
 alpha = 2^(LOG_OPACITY - (A dx^2 + B dx dy + C dy^2)). The slots from SLOPE on describe the ellipse
-alpha = 1/255 column by column, see `bins.py`.
+alpha = 1/255 column by column, see `passes.py`.
 """
 
 SIZE = 16

@@ -10,6 +10,8 @@ and the view alone,
 So the tiles sum up M, and A is applied once per Gaussian. v alone moves nothing but the opacity,
 so that of its row of M one number is needed, and 19 in all. The other columns of A come from the
 backward pass, given one of the six numbers at a time.
+
+What single Gaussians show of a view: their weights, summed over pixels one by one.
 """
 
 # Kernels have the types that Numba infers where they are called; annotations it would not read.
@@ -19,17 +21,13 @@ import numpy as np
 from numba import prange
 
 from r3jax.kernels.constants import TILE
-from r3jax.kernels.native.compiled import claim, inlined, kernel, parallel_kernel, prefetch
+from r3jax.kernels.native.compiled import claim, inlined, kernel, parallel_kernel
 from r3jax.kernels.splatting import records as at
 from r3jax.kernels.splatting.compositing import (
-    AHEAD,
-    ALPHA_MAX,
     PIXELS,
-    alpha_in_row,
     clear_tile,
     gradient_by_alpha,
-    in_tile,
-    take_light,
+    over_lists,
 )
 from r3jax.kernels.splatting.gradient import (
     ROOM,
@@ -42,8 +40,8 @@ from r3jax.kernels.splatting.gradient import (
 )
 from r3jax.kernels.splatting.lanes import (
     fma,
-    lane_numbers,
-    smaller,
+    keep_gt,
+    load,
     splat,
     store12,
     sums_of_10,
@@ -75,9 +73,9 @@ _HALF, _ZERO, _ONE = np.float32(0.5), np.float32(0.0), np.float32(1.0)
 
 
 @inlined
-def _read_tile(left, top, images, background, state):
+def _read_colors(left, top, inputs, state):
     """Lays out a tile: transmittance 1, and the pixel's color over black less alpha background."""
-    rgb, _, alpha = images
+    rgb, alpha, background = inputs
     # Pixels beside the image have no gradient.
     clear_tile(left, top, alpha.shape[1], alpha.shape[0], state)
     for y in range(min(TILE, alpha.shape[0] - top)):
@@ -87,74 +85,48 @@ def _read_tile(left, top, images, background, state):
             state[PIXELS + TILE * y + x] = color - alpha[v, u] * background
 
 
-@kernel
-def _squares_of_tile(
-    first, last, left, top, records, list_ids, list_slots, list_rows, background, state, slots
-):
-    """Writes the moments of a tile's intersections to their slots."""
-    flat = records.reshape(-1)
-    lanes = lane_numbers()
+@inlined
+def _no_moments():
     zero = splat(_ZERO)
-    for place in range(first, last):
-        if place + AHEAD < last:
-            prefetch(flat, list_ids[place + AHEAD] * at.SIZE)
-        record = records[list_ids[place]]
-        dx, across, slant, y = in_tile(record, left, top, lanes)
-        q = splat(record[at.RED] + record[at.GREEN] + record[at.BLUE] - background)
-        vv0, vv1, vv2, vv3, vv4 = zero, zero, zero, zero, zero
-        vw0, vw1, vw2, ww = zero, zero, zero, zero
-        rows = list_rows[place]
-        for row in range(rows & 15, (rows >> 4) + 1):
-            k = TILE * row
-            dy = y - np.float32(row)
-            free = alpha_in_row(record, dx, across, slant, dy)
-            alpha = smaller(free, splat(ALPHA_MAX))
-            weight = take_light(k, alpha, state)
-            v = gradient_by_alpha(k, free, alpha, weight, q, state)
-            vv, vw = v * v, v * weight
-            vv_dy, vw_dy = vv * dy, vw * dy
-            vv_dy2 = vv_dy * dy
-            vv_dy3 = vv_dy2 * dy
-            vv0, vv1, vv2 = vv0 + vv, vv1 + vv_dy, vv2 + vv_dy2
-            vv3, vv4 = vv3 + vv_dy3, fma(vv_dy3, dy, vv4)
-            vw0, vw1, vw2 = vw0 + vw, vw1 + vw_dy, fma(vw_dy, dy, vw2)
-            ww = fma(weight, weight, ww)
-        dx2 = dx * dx
-        dx3, dx4 = dx2 * dx, dx2 * dx2
-        a = sums_of_10(
-            vv0, vv0 * dx2, vv0 * dx3, vv0 * dx4,
-            vv1 * dx, vv1 * dx2, vv1 * dx3, vv2, vv2 * dx, vv2 * dx2,
-        )  # fmt: skip
-        b = sums_of_10(
-            vv3, vv3 * dx, vv4, vw0 * dx, vw0 * dx2, vw1, vw1 * dx, vw2, ww, zero
-        )  # fmt: skip
-        # In this order: each vector has twelve lanes, of which ten count.
-        slot = list_slots[place] * SLOT
-        store12(slots, slot, a)
-        store12(slots, slot + 10, b)
+    return zero, zero, zero, zero, zero, zero, zero, zero, zero
 
 
-@parallel_kernel
-def squares_of_all(lists, records, images, background, workers, slots):
-    """Computes the moments of all intersections, those of a Gaussian side by side."""
-    list_ids, list_slots, list_rows, tile_starts, tile_ends = lists
-    columns = -(-images[2].shape[1] // TILE)
-    next_tile = np.zeros(1, np.int64)
-    for _ in prange(workers):
-        state = np.empty(2 * PIXELS, np.float32)
-        tile = claim(next_tile)
-        while tile < tile_ends.shape[0]:
-            left, top = tile % columns * TILE, tile // columns * TILE
-            _read_tile(left, top, images, background, state)
-            end = tile_ends[tile]
-            _squares_of_tile(
-                tile_starts[tile], end, left, top,
-                records, list_ids, list_slots, list_rows, background, state, slots,
-            )  # fmt: skip
-            for place in range(end, tile_starts[tile + 1]):  # hidden behind the rest
-                slot = list_slots[place] * SLOT
-                slots[slot : slot + MOMENTS] = _ZERO
-            tile = claim(next_tile)
+@inlined
+def _add_moments(record, pixels, inputs, state, sums):
+    """Adds v^2 by powers of dy up to the fourth, v w by those up to the second, and w^2."""
+    k, dy, free, alpha, _, weight = pixels
+    vv0, vv1, vv2, vv3, vv4, vw0, vw1, vw2, ww = sums
+    q = splat(record[at.RED] + record[at.GREEN] + record[at.BLUE] - inputs[2])
+    v = gradient_by_alpha(k, free, alpha, weight, q, state)
+    vv, vw = v * v, v * weight
+    vv_dy, vw_dy = vv * dy, vw * dy
+    vv_dy2 = vv_dy * dy
+    vv_dy3 = vv_dy2 * dy
+    vv0, vv1, vv2 = vv0 + vv, vv1 + vv_dy, vv2 + vv_dy2
+    vv3, vv4 = vv3 + vv_dy3, fma(vv_dy3, dy, vv4)
+    vw0, vw1, vw2 = vw0 + vw, vw1 + vw_dy, fma(vw_dy, dy, vw2)
+    return vv0, vv1, vv2, vv3, vv4, vw0, vw1, vw2, fma(weight, weight, ww)
+
+
+@inlined
+def _store_moments(sums, dx, slots, slot):
+    vv0, vv1, vv2, vv3, vv4, vw0, vw1, vw2, ww = sums
+    dx2 = dx * dx
+    dx3, dx4 = dx2 * dx, dx2 * dx2
+    a = sums_of_10(
+        vv0, vv0 * dx2, vv0 * dx3, vv0 * dx4,
+        vv1 * dx, vv1 * dx2, vv1 * dx3, vv2, vv2 * dx, vv2 * dx2,
+    )  # fmt: skip
+    b = sums_of_10(
+        vv3, vv3 * dx, vv4, vw0 * dx, vw0 * dx2, vw1, vw1 * dx, vw2, ww, splat(_ZERO)
+    )  # fmt: skip
+    # In this order: each vector has twelve lanes, of which ten count.
+    store12(slots, slot, a)
+    store12(slots, slot + 10, b)
+
+
+_moments_of_all = over_lists(2, SLOT, _read_colors, _no_moments, _add_moments, _store_moments)
+"""Computes the moments of all intersections; takes rgb, alpha and the background."""
 
 
 @inlined
@@ -250,5 +222,74 @@ def squares_pass(cloud, view, workers, images, records, lists, background, squar
     size = alpha.shape[1], alpha.shape[0]
     slots = np.empty(np.int64(tile_starts[-1]) * SLOT + SLOT, np.float32)
     expect_writes(slots)
-    squares_of_all(lists, records, images, background, workers, slots)
+    _moments_of_all(lists, records, (images[0], alpha, background), size, workers, slots)
     _squares_of_cloud(cloud, records, slots, view, size, workers, squares)
+
+
+@inlined
+def _read_values(left, top, inputs, state):
+    """Lays out a tile: transmittance 1 in the image and 0 beside it, the value, what counts."""
+    value, counts, _ = inputs
+    clear_tile(left, top, value.shape[1], value.shape[0], state)
+    for y in range(min(TILE, value.shape[0] - top)):
+        for x in range(min(TILE, value.shape[1] - left)):
+            k = TILE * y + x
+            state[PIXELS + k] = value[top + y, left + x]
+            state[2 * PIXELS + k] = counts[top + y, left + x]
+
+
+@inlined
+def _no_tallies():
+    return splat(_ZERO), splat(_ZERO)
+
+
+@inlined
+def _add_tallies(record, pixels, inputs, state, sums):
+    """Adds weight x value, and what counts, of pixels above both limits."""
+    k, _, _, _, before, weight = pixels
+    least = inputs[2]
+    weight = keep_gt(keep_gt(weight, before, least[0]), weight, least[1])
+    total = fma(weight, load(state, PIXELS + k), sums[0])
+    return total, sums[1] + keep_gt(load(state, 2 * PIXELS + k), weight, _ZERO)
+
+
+@inlined
+def _store_tallies(sums, dx, slots, slot):
+    zero = splat(_ZERO)
+    both = sums_of_10(sums[0], sums[1], zero, zero, zero, zero, zero, zero, zero, zero)
+    store12(slots, slot, both)
+
+
+_tallies_of_all = over_lists(
+    3, at.GRADIENT_SIZE, _read_values, _no_tallies, _add_tallies, _store_tallies
+)
+"""Computes the tallies of all intersections; takes the value, what counts and the limits."""
+
+
+@kernel
+def tallies_pass(records, lists, workers, value, counts, least, tallies):
+    """Sums over pixels of single Gaussians' weights; takes what the forward pass wrote.
+
+    Args:
+        records: [n, 16].
+        lists: ids, slots, rows [budget], starts [tiles + 1], ends [tiles].
+        workers: threads to share the work.
+        value: [H, W].
+        counts: what each pixel counts, [H, W].
+        least: pixels are left out where the transmittance in front is not above the first, or
+            the weight not above the second.
+        tallies: written; [n, 2], the sum of weight x value, and of the counts.
+    """
+    tile_starts = lists[3]
+    slots = np.empty(np.int64(tile_starts[-1]) * at.GRADIENT_SIZE, np.float32)
+    expect_writes(slots)
+    size = value.shape[1], value.shape[0]
+    _tallies_of_all(lists, records, (value, counts, least), size, workers, slots)
+    integers = records.view(np.int32)
+    for i in range(records.shape[0]):
+        total, number = _ZERO, _ZERO
+        start = integers[i, at.START]
+        for slot in range(start, start + integers[i, at.COUNT]):
+            total += slots[slot * at.GRADIENT_SIZE]
+            number += slots[slot * at.GRADIENT_SIZE + 1]
+        tallies[i, 0], tallies[i, 1] = total, number

@@ -53,7 +53,7 @@ from r3jax.planning.robot.limits import Limits
 from r3jax.planning.robot.travel import Travel
 from r3jax.scoring.batch import cache_positions_near, score_cached_near
 from r3jax.scoring.gather import gather_in_range
-from r3jax.scoring.panorama_cache import PanoramaCache
+from r3jax.scoring.panorama import PanoramaCache
 from r3jax.scoring.simulated import simulate_view_near
 
 _NEIGHBORS = 8

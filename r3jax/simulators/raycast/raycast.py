@@ -18,7 +18,7 @@ import numpy as np
 from r3jax.errors import InputError
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, rigid_error
-from r3jax.simulators import start
+from r3jax.simulators import clearance
 from r3jax.simulators.clearance import SurfaceDistance
 from r3jax.simulators.raycast.rays import Hits, TriangleScene
 from r3jax.simulators.raycast.shading_tables import build_shading_tables
@@ -101,10 +101,12 @@ class RaycastSimulator:
             ValueError: no position in the mesh has half a meter of free space around it.
         """
         if self._start is None:
-            self._start = start.find_start(self._bounds, self._scene, self._distance, self._seed)
+            self._start = clearance.find_start(
+                self._bounds, self._scene, self._distance, self._seed
+            )
         if self._start is None:
             raise InputError(
-                f"{self.world.name}: found no place with {start.PROMISED_CLEARANCE} m free all "
+                f"{self.world.name}: found no place with {clearance.PROMISED_CLEARANCE} m free all "
                 "round to start from; is the scale meters and the up axis right? Otherwise give "
                 "a start_pose"
             )
@@ -204,17 +206,19 @@ class RaycastSimulator:
             problem = rigid_error(pose)
             if problem is not None:
                 raise InputError(f"start_pose: {problem}")
-            least = start.MIN_CLEARANCE
+            least = clearance.MIN_CLEARANCE
         elif self.world.start_position is not None:
-            pose = start.level_pose(self.world.start_position, self.world.start_yaw)
-            least = start.PROMISED_CLEARANCE
+            pose = clearance.level_pose(self.world.start_position, self.world.start_yaw)
+            least = clearance.PROMISED_CLEARANCE
         else:
             return None
         position = pose[:3, 3]
-        problem = start.start_problem(position, self._bounds, self._scene, self._distance, least)
+        problem = clearance.start_problem(
+            position, self._bounds, self._scene, self._distance, least
+        )
         if problem is None:
             return pose
-        free = start.find_start(self._bounds, self._scene, self._distance, self._seed)
+        free = clearance.find_start(self._bounds, self._scene, self._distance, self._seed)
         place = "" if free is None else f", for example {np.round(free[:3, 3], 2).tolist()}"
         raise InputError(
             f"{self.world.name}: the start at {np.round(position, 3).tolist()} {problem}. "

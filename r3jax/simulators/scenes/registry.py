@@ -10,11 +10,10 @@ from r3jax.geometry.cameras import Camera
 from r3jax.kernels.native.ahead import compile_ahead
 from r3jax.kernels.native.platform import is_cpu_only, missing_for_machine_code
 from r3jax.simulators.base import NoisySimulator, Simulator
-from r3jax.simulators.habitat.habitat import HabitatSimulator
-from r3jax.simulators.habitat.stage import read_stage
+from r3jax.simulators.habitat import HabitatSimulator, read_stage
 from r3jax.simulators.meshes import load_world
 from r3jax.simulators.raycast.raycast import RaycastSimulator
-from r3jax.simulators.scenes import procedural, replica
+from r3jax.simulators.scenes import names, procedural
 from r3jax.simulators.scenes.names import (
     OUTSIDE,
     check_scale,
@@ -63,7 +62,7 @@ def open_world(spec: str, up: str | None = None, scale: float | int = 1.0) -> Wo
     if up not in (None, "z"):
         raise InputError(f"up={up!r} is for mesh files; the scene {spec!r} is z-up")
     if kind == "replica":
-        return dataclasses.replace(load_world(replica.mesh_file(rest)), name=spec)
+        return dataclasses.replace(load_world(names.mesh_file(rest)), name=spec)
     return procedural.build(spec)
 
 

@@ -12,8 +12,7 @@ from jaxtyping import Array, Float
 from r3jax.geometry.cameras import Camera, invert_pose
 from r3jax.kernels import calls
 from r3jax.kernels.calls import Cloud, Drawn, Images
-from r3jax.splatting.backend import Composite
-from r3jax.splatting.config import RasterConfig
+from r3jax.splatting.backend import Composite, RasterConfig
 from r3jax.splatting.scene import GaussianScene
 
 _Size = tuple[tuple[int, int], int]

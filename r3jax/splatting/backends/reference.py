@@ -9,8 +9,7 @@ from jaxtyping import Array, Float
 
 from r3jax.geometry.cameras import Camera
 from r3jax.kernels.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from r3jax.splatting.backend import Composite
-from r3jax.splatting.config import RasterConfig
+from r3jax.splatting.backend import Composite, RasterConfig
 from r3jax.splatting.projection import ProjectedGaussians, project_gaussians
 from r3jax.splatting.scene import GaussianScene
 

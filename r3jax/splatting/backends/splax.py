@@ -3,7 +3,7 @@
 splax takes intrinsics as numbers known while compiling. Here they go into the view matrix
 instead: a point at (x, y, z) of a camera with (fx, fy, cx, cy) has the pixel that A (x, y, z) has
 in a fixed camera, A being linear; the Jacobian follows by the chain rule, so all gradients are
-exact. Colors come from `harmonics.py`.
+exact. Colors come from `projection.py`.
 
 What remains different from the other backends: alpha is cut off at 0.999 instead of 0.99, depths
 are sorted in as many bits as the tile leaves of 32, and sums are added up in any order.
@@ -19,10 +19,8 @@ from jaxtyping import Array, Float
 
 from r3jax.geometry.cameras import Camera, invert_pose
 from r3jax.kernels.constants import NEAR_PLANE
-from r3jax.splatting.backend import Composite
-from r3jax.splatting.config import RasterConfig
-from r3jax.splatting.harmonics import view_colors
-from r3jax.splatting.projection import without_nans
+from r3jax.splatting.backend import Composite, RasterConfig
+from r3jax.splatting.projection import view_colors, without_nans
 from r3jax.splatting.scene import GaussianScene
 
 

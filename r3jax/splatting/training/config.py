@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 
 from r3jax.errors import InputError
-from r3jax.splatting.config import RasterConfig
+from r3jax.splatting.backend import RasterConfig
 
 
 class Schedule(NamedTuple):

@@ -1,24 +1,34 @@
-"""Fits a scene of Gaussians to views: the loop on the host round the jitted step."""
+"""Fits a scene of Gaussians to views: the loop on the host round the jitted step.
+
+Before it starts, `check_memory` compares the memory that it needs with what is free. Its
+coefficients are those of the compiled training step, rounded up;
+tests/splatting/training/test_memory.py holds the estimate against XLA's own account. `Growth` adds
+views, and Gaussians for what they show, while training runs.
+
+Shape symbols: n rows of the scene; m newborn Gaussians.
+"""
 
 import dataclasses
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.spatial import KDTree
 
 from r3jax.errors import InputError
 from r3jax.geometry.arguments import checked, one, or_none
 from r3jax.interrupts import deferred_interrupt
-from r3jax.splatting.config import fitting_budget
-from r3jax.splatting.errors import TrainingDiverged
-from r3jax.splatting.scene import GaussianScene, a_scene, empty_scene
+from r3jax.kernels.constants import TILE
+from r3jax.splatting.errors import TooLargeError, TrainingDiverged
+from r3jax.splatting.scene import DEAD_LOGIT, GaussianScene, a_scene, empty_scene
 from r3jax.splatting.training.checkpoints import (
     begin_checkpoints,
     only_training,
@@ -27,9 +37,8 @@ from r3jax.splatting.training.checkpoints import (
     settings_record,
 )
 from r3jax.splatting.training.config import Schedule, TrainConfig
-from r3jax.splatting.training.growth import Growth, with_newborn
 from r3jax.splatting.training.initialize import initialize
-from r3jax.splatting.training.memory import check_memory
+from r3jax.splatting.training.optimizer import forget
 from r3jax.splatting.training.train_step import (
     DIVERGED,
     DONE,
@@ -42,6 +51,28 @@ from r3jax.splatting.training.train_step import (
     train_step,
 )
 from r3jax.splatting.views import Views, check_views
+
+
+class Addition(NamedTuple):
+    """Views and Gaussians to continue with."""
+
+    views: Views
+    """Keeps the number and the size of those before: another number would recompile the step."""
+
+    newborn: GaussianScene | None = None
+    """Gaussians that join, of the scene's harmonics; unused rows count for nothing."""
+
+
+class Growth(NamedTuple):
+    """When to add views."""
+
+    every: int
+    """Steps between two additions."""
+
+    add: Callable[[int, GaussianScene], Addition]
+    """Called with the number of steps and the scene, which must not be stored: the next step
+    donates its buffers."""
+
 
 IN_FLIGHT = 10
 """Steps handed to the device before the host waits and looks: few enough that a step which must
@@ -300,8 +331,7 @@ class _Loop:
 
     def _raise_budget(self, needed: int) -> None:
         """Makes room for a view that needs more; the next step is recompiled."""
-        budget = fitting_budget(needed)
-        raster = dataclasses.replace(self.run.config.raster, max_intersections=budget)
+        raster = self.run.config.raster.with_room(needed)
         config = dataclasses.replace(self.run.config, raster=raster)
         self.run = dataclasses.replace(self.run, config=config)
         self.is_compiled = False
@@ -355,3 +385,207 @@ class _Loop:
             return np.array([getattr(info, name) for info in self.infos])
 
         return History(self.first_step, column("loss"), column("psnr"), column("num_gaussians"))
+
+
+_GEOMETRY_FLOATS = 3 + 4 + 3 + 1
+"""Mean, rotation, scales and opacity of a Gaussian."""
+
+_COPIES = 8
+"""Copies of every parameter: itself, its gradient and Adam's two moments, each before and after."""
+
+_BYTES_PER_ROW = 200
+"""Projection, its gradient and the density statistics of a Gaussian."""
+
+_BYTES_PER_INTERSECTION = 64
+"""Keys, order, and the gradient that waits for its reduction."""
+
+_BYTES_PER_PIXEL = 400
+"""The rendering, the loss and their gradients."""
+
+_ARRAYS_PER_BATCH = 12
+"""Arrays of a number for each pixel and Gaussian of a batch that the gradient of `xla` holds."""
+
+_RESERVE = 0.05
+"""Share of the free memory that is left alone, for the compiler (some 300 MB) among others."""
+
+
+def training_bytes(width: int, height: int, config: TrainConfig, rows: int | None = None) -> int:
+    """Estimates the memory of training besides the images of the views [bytes].
+
+    Args:
+        width: of the views [px].
+        height: of the views [px].
+        config: strategy, backend and sizes.
+        rows: capacity of the scene. None: that of the config.
+    """
+    rows = config.rows if rows is None else rows
+    sh_floats = 3 * (config.sh_degree + 1) ** 2
+    per_row = 4 * _COPIES * (_GEOMETRY_FLOATS + sh_floats) + _BYTES_PER_ROW
+    intersections = config.raster.budget(rows) * _BYTES_PER_INTERSECTION
+    total = rows * per_row + intersections + width * height * _BYTES_PER_PIXEL
+    if config.raster.backend == "numba":
+        return total
+    tiles = min(config.raster.tiles_per_batch, -(-width // TILE) * -(-height // TILE))
+    pairs = tiles * TILE * TILE * config.raster.gaussians_per_chunk
+    return total + 4 * _ARRAYS_PER_BATCH * pairs
+
+
+def free_bytes(device: Any = None) -> int | None:
+    """Returns the bytes that are free for the device's arrays; None where it is not known.
+
+    Args:
+        device: one of `jax.devices()`, the first by default. On a CPU the limits of the
+            container count, too.
+    """
+    device = jax.devices()[0] if device is None else device
+    if device.platform == "cpu":
+        return min(_free_on_host(), default=None)
+    stats = device.memory_stats()
+    if not stats or "bytes_limit" not in stats:
+        return None
+    return stats["bytes_limit"] - stats.get("bytes_in_use", 0)
+
+
+def _free_on_host(root: Path = Path("/")) -> Iterator[int]:
+    """Measures the free memory of the machine, and of each control group of this process."""
+    available = _number_after(root / "proc/meminfo", "MemAvailable:")
+    if available is not None:
+        yield available * 1024  # kB
+    elif "SC_PHYS_PAGES" in os.sysconf_names:
+        yield os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    for folder, names in _control_groups(root):
+        limit = _number(folder / names.limit)
+        usage = _number(folder / names.usage)
+        if limit is not None and usage is not None:
+            cache = _number_after(folder / "memory.stat", names.cache) or 0
+            yield max(0, limit - usage + cache)  # files kept in memory give way
+
+
+class _Names(NamedTuple):
+    """How a version of control groups calls its numbers."""
+
+    limit: str
+    usage: str
+    cache: str
+
+
+_VERSION_1 = _Names("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
+_VERSION_2 = _Names("memory.max", "memory.current", "inactive_file")
+
+
+def _control_groups(root: Path) -> Iterator[tuple[Path, _Names]]:
+    """Yields folders of the control groups that hold this process, innermost first."""
+    for line in _read(root / "proc/self/cgroup").splitlines():
+        number, _, rest = line.partition(":")
+        controllers, _, path = rest.partition(":")
+        if number == "0":
+            base, names = root / "sys/fs/cgroup", _VERSION_2
+        elif "memory" in controllers.split(","):
+            base, names = root / "sys/fs/cgroup/memory", _VERSION_1
+        else:
+            continue
+        inner = base / path.strip().lstrip("/")
+        for folder in (inner, *inner.parents):
+            yield folder, names
+            if folder == base:
+                break
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return ""
+
+
+def _number(path: Path) -> int | None:
+    """Reads the number in a file; None if it is missing or says `max`."""
+    text = _read(path).strip()
+    return int(text) if text.isdecimal() else None
+
+
+def _number_after(path: Path, name: str) -> int | None:
+    """Reads the number after a name in a file of such lines."""
+    for line in _read(path).splitlines():
+        words = line.split()
+        if len(words) >= 2 and words[0] == name and words[1].isdecimal():
+            return int(words[1])
+    return None
+
+
+def check_memory(views: Views, config: TrainConfig, *, free: int | None = None) -> None:
+    """Refuses a training that would not fit, before anything is allocated or compiled.
+
+    Args:
+        views: the training views, already in memory.
+        config: sizes, strategy and backend.
+        free: bytes. None: what the device has free; nothing is refused where that is not known.
+
+    Raises:
+        TooLargeError: it would not fit; the message says how much is needed, how much is free
+            and how many Gaussians would fit.
+    """
+    free = free_bytes() if free is None else free
+    if free is None:
+        return
+    usable = int((1.0 - _RESERVE) * free)
+    needed = training_bytes(views.width, views.height, config)
+    if needed <= usable:
+        return
+    fitting = _most_rows(views.width, views.height, config, usable)
+    raise TooLargeError(
+        f"room for {config.rows} Gaussians (SH degree {config.sh_degree}) needs about "
+        f"{needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free: "
+        + (f"at most {fitting} fit" if fitting else "none would fit; lower the resolution, too")
+    )
+
+
+def _most_rows(width: int, height: int, config: TrainConfig, usable: int) -> int:
+    """Finds the largest capacity that fits: the estimate grows with it. 0 if not even 1 does."""
+    low, high = 0, config.rows
+    while high - low > 1:
+        middle = (low + high) // 2
+        if training_bytes(width, height, config, middle) <= usable:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+def with_newborn(state: TrainState, newborn: GaussianScene) -> TrainState:
+    """Puts Gaussians into unused rows, without moments; those that find none are counted."""
+    is_born = np.asarray(newborn.is_alive)
+    free = np.flatnonzero(~np.asarray(state.scene.is_alive))
+    # Past the end where there is no room, and for rows that are not in use: dropped.
+    rank = np.cumsum(is_born) - 1
+    has_room = is_born & (rank < len(free))
+    row = np.full(len(is_born), state.scene.capacity)
+    row[has_room] = free[rank[has_room]]
+    put = lambda x, y: x.at[jnp.asarray(row)].set(y, mode="drop")
+    scene = jax.tree.map(put, state.scene, newborn)
+    is_new = np.zeros(state.scene.capacity, dtype=bool)
+    is_new[row[has_room]] = True
+    lost = jnp.asarray(int(is_born.sum() - has_room.sum()), dtype=jnp.int32)
+    return TrainState(
+        scene=scene,
+        moments=forget(state.moments, jnp.asarray(is_new)),
+        statistics=state.statistics,
+        step=state.step,
+        dropped=state.dropped + lost,
+    )
+
+
+def where_new(newborn: GaussianScene, scene: GaussianScene) -> GaussianScene:
+    """Keeps the Gaussians that are farther from all of a scene than they are large.
+
+    Args:
+        newborn: round Gaussians, as `initialize` makes them.
+        scene: what is there already.
+    """
+    there = np.asarray(scene.means)[np.asarray(scene.is_alive)]
+    if len(there) == 0:
+        return newborn
+    distance, _ = KDTree(there).query(np.asarray(newborn.means), workers=-1)
+    is_known = distance < np.exp(np.asarray(newborn.log_scales)[:, 0])
+    logits = jnp.where(jnp.asarray(is_known), DEAD_LOGIT, newborn.opacity_logits)
+    return eqx.tree_at(lambda s: s.opacity_logits, newborn, logits)

@@ -15,8 +15,7 @@ from r3jax.apps.benchmark.reference_images import load_reference_images
 from r3jax.apps.benchmark.site import write_site
 from r3jax.apps.benchmark.tables import PAPER_METRICS, metric_named
 from r3jax.cli.main import main
-from r3jax.evaluation.comparison import scores_by_method
-from r3jax.evaluation.statistics import mean_over_scenes
+from r3jax.evaluation.comparison import mean_over_scenes, scores_by_method
 from tests.evaluation.records import benchmark, record
 
 

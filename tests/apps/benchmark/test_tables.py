@@ -12,8 +12,12 @@ from r3jax.apps.benchmark.tables import (
     on_equal_terms,
     reference_in,
 )
-from r3jax.evaluation.comparison import check_equal_terms, scores_by_method
-from r3jax.evaluation.statistics import mean_over_scenes, paired_difference
+from r3jax.evaluation.comparison import (
+    check_equal_terms,
+    mean_over_scenes,
+    paired_difference,
+    scores_by_method,
+)
 from tests.evaluation.records import benchmark, record
 
 TRAINING = record()["training"]

@@ -27,7 +27,7 @@ from r3jax.mapping.state import empty_map
 from r3jax.plots import style
 from r3jax.runs.header import RunError, camera_fields
 from r3jax.runs.reader import read_run
-from r3jax.runs.reasons import explain_run
+from r3jax.runs.replay import explain_run
 from r3jax.runs.writer import RunWriter
 from r3jax.scoring.explain import CAUSES
 from tests.exploration.toys import BoxRoom, Wander

@@ -19,7 +19,7 @@ from r3jax.apps.viewer.blocks import (
     probe_positions,
     surface_terms,
 )
-from r3jax.apps.viewer.color_maps import UNSEEN
+from r3jax.apps.viewer.pictures import UNSEEN
 from r3jax.apps.viewer.story import Timeline
 from r3jax.geometry.voxels import INDEX_LIMIT
 from r3jax.mapping.seen import visible_rows

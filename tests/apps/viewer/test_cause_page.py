@@ -9,10 +9,10 @@ import pytest
 pytest.importorskip("viser", reason="the viewer needs viser, which is not installed")
 
 from r3jax.apps.viewer.blocks import CAUSE
-from r3jax.apps.viewer.color_maps import CAUSE_COLORS, UNSEEN
 from r3jax.apps.viewer.facts import LAYERS
-from r3jax.apps.viewer.recorded import open_run_page
-from r3jax.runs.reasons import explain_run
+from r3jax.apps.viewer.pages import open_run_page
+from r3jax.apps.viewer.pictures import CAUSE_COLORS, UNSEEN
+from r3jax.runs.replay import explain_run
 from tests.apps.viewer.conftest import VIEWS
 
 PATIENCE = 240.0  # seconds; of a machine with other work, that compiles

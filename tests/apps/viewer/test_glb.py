@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from r3jax.apps.viewer import recorded
-from r3jax.apps.viewer.recorded import world_glb
+from r3jax.apps.viewer import pages
+from r3jax.apps.viewer.pages import world_glb
 from r3jax.simulators.world import Material, World
 
 TEXTURE = np.zeros((2, 2, 3), np.uint8)
@@ -79,6 +79,6 @@ def test_colors_of_corners_come_along():
 
 
 def test_too_many_triangles_are_refused(monkeypatch):
-    monkeypatch.setattr(recorded, "MAX_FACES", 2)
+    monkeypatch.setattr(pages, "MAX_FACES", 2)
     with pytest.raises(ValueError, match=r"3.*2"):
         world_glb(make_world())

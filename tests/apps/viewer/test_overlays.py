@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r3jax.apps.viewer.overlays import (
+from r3jax.apps.viewer.pictures import (
     frustum_corners,
     frustum_segments,
     path_segments,

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import r3jax
-from r3jax.apps.viewer.color_maps import paint
-from r3jax.apps.viewer.preview import (
+from r3jax.apps.viewer.pictures import (
     TERMS,
     Context,
+    paint,
     preview_from,
     preview_pictures,
     quick_preview_from,

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from r3jax.apps.viewer.blocks import Blocks, block_causes, cause_colors
-from r3jax.apps.viewer.color_maps import UNSEEN
+from r3jax.apps.viewer.pictures import UNSEEN
 from r3jax.apps.viewer.story import RecordedStory
 from r3jax.plots import style
-from r3jax.runs.reasons import Reason, explain_run
+from r3jax.runs.replay import Reason, explain_run
 from tests.apps.viewer.conftest import VIEWS
 
 CAPACITY = 16

@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from r3jax.errors import InputError
 from r3jax.geometry.cameras import Camera
+from r3jax.simulators import habitat
 from r3jax.simulators.base import NoisySimulator, Simulator
-from r3jax.simulators.habitat import habitat
-from r3jax.simulators.habitat.stage import BARE_GLB
+from r3jax.simulators.habitat import BARE_GLB
 from r3jax.simulators.meshes import load_world, world_from_file
 from r3jax.simulators.raycast.embree import library
 from r3jax.simulators.raycast.raycast import RaycastSimulator
@@ -268,7 +268,7 @@ def test_noise_is_kept_from_the_terminal_and_trouble_is_not(room, monkeypatch, c
 
 
 def test_trouble_is_told_when_habitat_ends_the_process():
-    program = "import os; from r3jax.simulators.habitat import habitat\n"
+    program = "import os; from r3jax.simulators import habitat\n"
     program += "with habitat._without_noise(): os.write(2, b'no device'); os.abort()"
     done = subprocess.run([sys.executable, "-c", program], stderr=subprocess.PIPE)
     assert done.returncode == -signal.SIGABRT

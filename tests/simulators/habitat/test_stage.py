@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from r3jax.errors import InputError
 from r3jax.geometry.cameras import Camera
 from r3jax.simulators import meshes
-from r3jax.simulators.habitat.stage import (
+from r3jax.simulators.habitat import (
     BARE_GLB,
     agent_from_pose,
     habitat_from_axes,

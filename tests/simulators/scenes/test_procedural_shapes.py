@@ -5,7 +5,7 @@ import pytest
 
 from r3jax.errors import InputError
 from r3jax.simulators.scenes.procedural import shapes
-from r3jax.simulators.scenes.procedural.materials import patterns, textures
+from r3jax.simulators.scenes.procedural.materials import textures
 from r3jax.simulators.scenes.procedural.materials.textures import cloud
 from r3jax.simulators.scenes.procedural.model import Finish, Model
 from r3jax.simulators.world import Material
@@ -87,7 +87,7 @@ def test_fields_are_normal_and_repeat_without_a_seam():
         lambda: textures.wood((0.7, 0.5, 0.3), 4),
         lambda: textures.marble((0.9, 0.9, 0.9), (0.4, 0.4, 0.4), 5),
         lambda: textures.terrazzo((0.8, 0.8, 0.7), ((0.5, 0.3, 0.2),), 6),
-        lambda: patterns.wallpaper(
+        lambda: textures.wallpaper(
             (0.9, 0.9, 0.8), ((0.4, 0.5, 0.4), (0.7, 0.5, 0.4)), "botanical", 7
         ),
     ],
@@ -103,4 +103,4 @@ def test_textures_repeat_without_a_seam(texture):
 
 def test_an_unknown_motif_lists_the_known_ones():
     with pytest.raises(ValueError, match=r"'dots'.*botanical"):
-        patterns.wallpaper((1.0, 1.0, 1.0), ((0.0, 0.0, 0.0),), "dots", 1)
+        textures.wallpaper((1.0, 1.0, 1.0), ((0.0, 0.0, 0.0),), "dots", 1)

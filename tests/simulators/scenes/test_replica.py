@@ -8,12 +8,12 @@ import pytest
 import trimesh
 
 from r3jax.geometry.cameras import Camera
+from r3jax.simulators import habitat
 from r3jax.simulators.base import NoisySimulator
 from r3jax.simulators.free_space import GroundTruth
-from r3jax.simulators.habitat import habitat
 from r3jax.simulators.meshes import load_world
 from r3jax.simulators.raycast.raycast import RaycastSimulator
-from r3jax.simulators.scenes import registry, replica
+from r3jax.simulators.scenes import names, registry
 from tests.simulators.habitat.fake_habitat import FakeHabitat
 
 CAMERA = Camera.from_fov(32, 24, 60.0)
@@ -31,7 +31,7 @@ def root(tmp_path, monkeypatch):
     box.export(folder / "mesh.ply")
     stage = {"render_asset": "../mesh.ply", "up": [0, 0, 1], "front": [0, 1, 0]}
     (folder / "habitat" / "replicaSDK_stage.stage_config.json").write_text(json.dumps(stage))
-    monkeypatch.setenv(replica.ROOT, str(tmp_path))
+    monkeypatch.setenv(names.REPLICA_ROOT, str(tmp_path))
     return tmp_path
 
 
@@ -57,7 +57,7 @@ def fake(root, monkeypatch):
 
 
 def test_there_are_nine_scenes():
-    assert replica.names() == [
+    assert names.replica_names() == [
         "hotel0",
         *(f"office{k}" for k in range(5)),
         *(f"room{k}" for k in range(3)),
@@ -86,9 +86,7 @@ def test_habitat_shows_the_same_scene(fake, root):
     a, b = theirs.render(pose), ours.render(pose)
     np.testing.assert_allclose(a.depth, b.depth, rtol=1e-4)
     np.testing.assert_allclose(a.rgb, b.rgb, atol=0.01)
-    dark = habitat.HabitatSimulator(
-        replica.stage_file("office0"), CAMERA, mesh_colors=False, seed=1
-    )
+    dark = habitat.HabitatSimulator(names.stage_file("office0"), CAMERA, mesh_colors=False, seed=1)
     np.testing.assert_allclose(dark.render(pose).rgb, np.asarray(b.rgb) * 100 / 255, atol=0.01)
     assert dark.content_hash != registry.scene_hash(theirs)
     assert fake.started[0][0].scene_id.startswith(str(root / "office_0" / "habitat"))
@@ -109,7 +107,7 @@ def test_the_stage_config_of_the_download_will_do(root):
     (folder / "replicaSDK_stage.stage_config.json").rename(
         folder / "replica_stage.stage_config.json"
     )
-    assert replica.stage_file("office0") == folder / "replica_stage.stage_config.json"
+    assert names.stage_file("office0") == folder / "replica_stage.stage_config.json"
 
 
 def test_without_habitat_it_says_how_to_get_it(root, monkeypatch):
@@ -120,9 +118,9 @@ def test_without_habitat_it_says_how_to_get_it(root, monkeypatch):
 
 @pytest.mark.parametrize("value", [None, ""])
 def test_without_the_variable_it_says_how_to_get_the_data(monkeypatch, value):
-    monkeypatch.delenv(replica.ROOT, raising=False)
+    monkeypatch.delenv(names.REPLICA_ROOT, raising=False)
     if value is not None:
-        monkeypatch.setenv(replica.ROOT, value)
+        monkeypatch.setenv(names.REPLICA_ROOT, value)
     for scene in ("replica:room2", "habitat:room2"):
         with pytest.raises(ValueError, match=r"R3JAX_REPLICA_ROOT.*Replica-Dataset.*download\.sh"):
             registry.open_scene(scene, camera=CAMERA)

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from r3jax.geometry.cameras import Camera
+from r3jax.splatting.backend import RasterConfig
 from r3jax.splatting.backends import numba, reference
-from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.scene import GaussianScene
 from tests.splatting.clouds import random_cloud, safe_pixels, view
 from tests.tiers import quick_and_full

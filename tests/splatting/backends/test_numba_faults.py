@@ -15,19 +15,16 @@ from r3jax.baselines.information import pixel_squares, pixel_tallies
 from r3jax.geometry.cameras import invert_pose
 from r3jax.kernels.constants import ALPHA_MIN, TILE
 from r3jax.kernels.splatting import records
+from r3jax.splatting.backend import RasterConfig
 from r3jax.splatting.backends import reference
-from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.projection import project_gaussians
 from tests.plain_kernels import Modules, kernels_as_python, load
 from tests.splatting.clouds import random_cloud, safe_pixels, view
 
 PACKAGE = "r3jax.kernels.splatting"
 CHAIN = tuple(
-    f"{PACKAGE}.{name}"
-    for name in (
-        "harmonics", "project", "bins", "compositing", "gradient", "passes", "squares", "tallies",
-    )
-)  # fmt: skip
+    f"{PACKAGE}.{name}" for name in ("project", "compositing", "gradient", "passes", "squares")
+)
 COUNT, SIZE, BUDGET = 70, (40, 24), 1024
 BEHIND = np.array([0.2, 0.7, 0.4], np.float32)
 LEAST = (0.3, 0.02)
@@ -189,7 +186,7 @@ def tallies_agree(modules: Modules) -> None:
     value, found = np.abs(_case.weights[1]), dirty((COUNT, 2), np.float32)
     counts = (_case.safe & (value > 0.5)).astype(np.float32)
     with mock.patch.object(np, "empty", dirty):
-        modules["tallies"].tallies_pass(table, lists, 2, value, counts, np.array(LEAST), found)
+        modules["squares"].tallies_pass(table, lists, 2, value, counts, np.array(LEAST), found)
     value, counts = jnp.asarray(value), jnp.asarray(counts)
     expected, _ = pixel_tallies(
         _case.scene, _case.camera, _case.pose, value, counts, RasterConfig(),

@@ -14,9 +14,9 @@ import pytest
 
 from r3jax.kernels.native import ffi, platform
 from r3jax.splatting import backend
+from r3jax.splatting.backend import RasterConfig
 from r3jax.splatting.backends import numba
 from r3jax.splatting.backends.xla import rasterize as xla_rasterize
-from r3jax.splatting.config import RasterConfig
 from tests.splatting.clouds import random_cloud, view
 
 pytestmark = pytest.mark.full
@@ -100,7 +100,7 @@ TRAINING = """
     import os, sys
     if sys.argv[1] == "before": os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     import jax, jax.numpy as jnp
-    from r3jax.splatting.config import RasterConfig
+    from r3jax.splatting.backend import RasterConfig
     from r3jax.splatting.render import render
     from tests.splatting.clouds import random_cloud, view
     if sys.argv[1] == "after":

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from r3jax.splatting.backend import RasterConfig
 from r3jax.splatting.backends import reference
-from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.projection import ProjectedGaussians, project_gaussians
 from tests.splatting.clouds import random_cloud, view
 

@@ -17,9 +17,8 @@ import pytest
 
 from r3jax.geometry.cameras import invert_pose
 from r3jax.kernels.constants import DILATION, NEAR_PLANE
-from r3jax.splatting.backend import find_backend
+from r3jax.splatting.backend import RasterConfig, find_backend
 from r3jax.splatting.backends import reference, splax
-from r3jax.splatting.config import RasterConfig
 from r3jax.splatting.projection import ProjectedGaussians, rotation_rows
 from r3jax.splatting.scene import GaussianScene
 from tests.splatting.clouds import random_cloud, view

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r3jax.splatting.backends import tiles
+from r3jax.splatting.backends import xla
 
 COUNT, WIDTH, HEIGHT, BUDGET = 60, 50, 38, 400
 COLUMNS, ROWS = 4, 3
@@ -43,7 +43,7 @@ def expected_lists(center, reach, depth) -> list[list[int]]:
 
 def compiled(budget: int = BUDGET):
     """`list_tiles`, for images of one size."""
-    function = tiles.list_tiles
+    function = xla.list_tiles
     return jax.jit(lambda c, r, d: function(c, r, d, WIDTH, HEIGHT, budget))
 
 
@@ -98,7 +98,7 @@ def test_every_size_of_the_sort_gives_the_same(share):
 
 
 _list_many = jax.jit(
-    lambda c, r, d, budget: tiles.list_tiles(c, r, d, 64, 64, budget), static_argnums=3
+    lambda c, r, d, budget: xla.list_tiles(c, r, d, 64, 64, budget), static_argnums=3
 )
 
 
@@ -106,7 +106,7 @@ def test_counts_saturate_where_they_would_wrap_around():
     """70 000 Gaussians that each cover 36 864 tiles: more pairs than an int32 holds."""
     count, edge = 70_000, 192 * 16
     big = jnp.full((2, count), 1e6)
-    lists = jax.jit(lambda r: tiles.list_tiles(r * 0.0, r, r[0], edge, edge, 1000))(big)
+    lists = jax.jit(lambda r: xla.list_tiles(r * 0.0, r, r[0], edge, edge, 1000))(big)
     assert int(lists.num_intersections) == 2**31 - 1
     assert int(lists.overflow) == 2**31 - 1 - 1000
     assert int(lists.count.sum()) == 1000
@@ -117,7 +117,7 @@ def test_pairs_that_do_not_fit_one_integer_are_sorted_all_the_same():
     rng = np.random.default_rng(2)
     tile = jnp.asarray(rng.integers(0, 10, 200), dtype=jnp.int32)
     rank = jnp.asarray(rng.permutation(200), dtype=jnp.int32)
-    sort = tiles._sort_pairs
+    sort = xla._sort_pairs
     narrow, wide = sort(tile, rank, 10, 200), sort(tile, rank, 10, 2**30)
     for one, other in zip(narrow, wide, strict=True):
         np.testing.assert_array_equal(one, other)

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from r3jax.geometry.cameras import Camera, look_at
+from r3jax.splatting.backend import RasterConfig
 from r3jax.splatting.backends import reference, xla
-from r3jax.splatting.config import RasterConfig, fitting_budget
 from tests.splatting.clouds import random_cloud, safe_pixels, view
 
 COUNT, SIZE, BUDGET = 120, (50, 38), 1 << 12
@@ -222,5 +222,8 @@ def test_memory_does_not_grow_with_the_layers():
 
 
 def test_a_growing_scene_compiles_seldom():
-    budgets = {fitting_budget(needed) for needed in range(1000, 1_000_000, 1000)}
+    budgets = {
+        RasterConfig().with_room(needed).max_intersections
+        for needed in range(1000, 1_000_000, 1000)
+    }
     assert len(budgets) < 50

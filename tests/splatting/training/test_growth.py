@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from r3jax.splatting.scene import empty_scene
-from r3jax.splatting.training.growth import Addition, Growth, where_new, with_newborn
 from r3jax.splatting.training.initialize import initialize
-from r3jax.splatting.training.train import fit
+from r3jax.splatting.training.train import Addition, Growth, fit, where_new, with_newborn
 from r3jax.splatting.training.train_step import start_state
 from tests.splatting.ball import ball_views, config
 

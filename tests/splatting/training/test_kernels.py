@@ -6,15 +6,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r3jax.kernels import training
 from r3jax.kernels.native import ffi
 from r3jax.kernels.native.compiled import flush_denormals, parallel_kernel
 from r3jax.splatting.scene import GaussianScene, empty_scene
-from r3jax.splatting.training import loss, optimizer
+from r3jax.splatting.training import optimizer, train_step
 from r3jax.splatting.training.config import TrainConfig
 from tests.plain_kernels import Modules, kernels_as_python, load
 
-CHAIN = tuple(f"{training.__name__}.{name}" for name in ("image_loss", "adam"))
+CHAIN = tuple(f"r3jax.kernels.{name}" for name in ("image_loss", "adam"))
 WEIGHT = 0.3
 SIZES = ((7, 5), (24, 20), (70, 33), (1, 1))
 """Of images: lower than the window, of whole vectors, of several bands, a pixel."""
@@ -52,7 +51,7 @@ def kernel_of_loss(modules: Modules, x, y):
 def law_loss_and_its_gradient_are_the_formulas(modules: Modules) -> None:
     for size in ((9, 7), (35, 6)):
         x, y = images(*size)
-        assert_same_loss(kernel_of_loss(modules, x, y), loss_by(loss._by_formulas, x, y))
+        assert_same_loss(kernel_of_loss(modules, x, y), loss_by(train_step._by_formulas, x, y))
 
 
 def assert_same_loss(found, expected) -> None:
@@ -65,14 +64,14 @@ def assert_same_loss(found, expected) -> None:
 def test_the_loss_and_its_gradient_are_those_of_the_formulas(size):
     x, y = images(*size)
     for weight in (0.0, 0.2, 1.0):
-        found = loss_by(loss._by_kernels, x, y, weight)
-        assert_same_loss(found, loss_by(loss._by_formulas, x, y, weight))
+        found = loss_by(train_step._by_kernels, x, y, weight)
+        assert_same_loss(found, loss_by(train_step._by_formulas, x, y, weight))
 
 
 def test_an_image_that_is_no_number_has_a_loss_that_is_none():
     x, y = images(24, 20)
     x[3, 4, 1] = np.nan
-    value, _, _ = loss_by(loss._by_kernels, x, y)
+    value, _, _ = loss_by(train_step._by_kernels, x, y)
     assert np.isnan(value)
 
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import convolve
 from skimage.metrics import structural_similarity as skimage_ssim
 
-from r3jax.splatting.training import loss
+from r3jax.splatting.training import train_step
 
 HEIGHT, WIDTH = 24, 20
 
@@ -62,13 +62,13 @@ def test_the_oracle_is_scikit_image_away_from_the_edges():
 def test_loss_equals_the_oracle() -> None:
     for seed, weight in ((1, 0.2), (2, 0.0), (3, 1.0)):
         x, y = images(seed)
-        ours = loss.photometric_loss(float32(x), float32(y), weight)
+        ours = train_step.photometric_loss(float32(x), float32(y), weight)
         assert abs(float(ours) - loss64(x, y, weight)) < 2e-6
 
 
 def test_gradient_equals_finite_differences() -> None:
     x, y = images(4)
-    objective = loss.photometric_loss
+    objective = train_step.photometric_loss
     gradient = jax.jit(jax.grad(lambda image: objective(image, float32(y), 0.2)))(float32(x))
     # Corner, edge and middle; the step stays on one side of |x - y| = 0.
     for pixel in ((0, 0, 0), (0, 7, 1), (12, 10, 2), (23, 19, 0), (5, 18, 1)):
@@ -81,7 +81,7 @@ def test_gradient_equals_finite_differences() -> None:
 @given(st.integers(0, 2**31))
 def test_equal_images_have_no_loss_and_others_have_some(seed):
     x, y = (float32(image) for image in images(seed))
-    objective = jax.jit(loss.photometric_loss)
+    objective = jax.jit(train_step.photometric_loss)
     assert abs(float(objective(x, x, 0.2))) < 1e-6
     assert float(objective(x, y, 0.2)) > 0.01
 
@@ -90,11 +90,11 @@ def test_equal_images_have_no_loss_and_others_have_some(seed):
 def test_the_blur_is_its_own_transpose(seed):
     a, b = np.random.default_rng(seed).normal(size=(2, 3, HEIGHT, WIDTH))
     a, b = float32(a), float32(b)
-    blur = jax.jit(loss.blur)
+    blur = jax.jit(train_step.blur)
     left, right = jnp.vdot(blur(a), b), jnp.vdot(a, blur(b))
     np.testing.assert_allclose(left, right, atol=1e-3)
 
 
 def test_psnr_of_known_errors():
     mse = jnp.array([1.0, 0.1, 0.01, 0.0])
-    np.testing.assert_allclose(loss.psnr_of(mse), [0.0, 10.0, 20.0, 100.0], atol=1e-4)
+    np.testing.assert_allclose(train_step.psnr_of(mse), [0.0, 10.0, 20.0, 100.0], atol=1e-4)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from r3jax.splatting.scene import DEAD_LOGIT, GaussianScene
-from r3jax.splatting.training import mcmc
+from r3jax.splatting.training import density
 from r3jax.splatting.training.config import TrainConfig
 from r3jax.splatting.training.optimizer import Moments
 
@@ -60,7 +60,7 @@ def test_formula() -> None:
     numbers = np.array([1, 2, 3, 10, 51])
     grid = [(o, n) for o in opacities for n in numbers]
     expected = np.array([share64(o, int(n)) for o, n in grid])
-    share, factor = mcmc.shared(
+    share, factor = density.shared(
         jnp.asarray([o for o, _ in grid], dtype=jnp.float32),
         jnp.asarray([n for _, n in grid], dtype=jnp.int32),
     )
@@ -74,7 +74,7 @@ def test_same_picture() -> None:
     x = np.linspace(-12.0, 12.0, 20001)
     for opacity, number in ((0.3, 2), (0.8, 5), (0.97, 30)):
         o = jnp.asarray([opacity], dtype=jnp.float32)
-        share, factor = mcmc.shared(o, jnp.asarray([number]))
+        share, factor = density.shared(o, jnp.asarray([number]))
         share, factor = float(share[0]), float(factor[0])
         assert abs(1.0 - (1.0 - share) ** number - opacity) < 1e-5
         before = opacity * np.exp(-0.5 * x**2)
@@ -86,7 +86,7 @@ def test_noise() -> None:
     """rate x 5e5 x gate x R S^2 R^T times the same normal draws, in float64."""
     scene = some_scene([0.001, 0.005, 0.02, 0.1, 0.9, 0.0])
     rate = 3e-7
-    after = mcmc.perturbed(scene, jnp.asarray(rate), CONFIG, key=KEY)
+    after = density.perturbed(scene, jnp.asarray(rate), CONFIG, key=KEY)
     normal = np.asarray(jax.random.normal(KEY, (6, 3)), dtype=np.float64)
     R = Rotation.from_quat(np.asarray(scene.quats), scalar_first=True).as_matrix()
     S2 = np.exp(2.0 * np.asarray(scene.log_scales, dtype=np.float64))
@@ -105,7 +105,7 @@ def test_respawn() -> None:
     scene = some_scene([0.9, 0.0, 0.003, 0.001])
     rows = jnp.array([False, False, True, True])
     only_first = jnp.array([0.9, 0.0, 0.0, 0.0])
-    after, moments = mcmc.respawn(scene, some_moments(scene), rows, CONFIG, key=KEY)
+    after, moments = density.respawn(scene, some_moments(scene), rows, CONFIG, key=KEY)
     share, factor = share64(float(only_first[0]), 3)
     for index in (0, 2, 3):
         copy, source = row(after, index), row(scene, 0)
@@ -125,11 +125,11 @@ def test_regularization() -> None:
     scene = some_scene([0.9, 0.2, 0.0, 0.0])
     alive = np.exp(np.asarray(scene.log_scales[:2], dtype=np.float64))
     expected = 0.01 * 0.55 + 0.01 * alive.mean()
-    np.testing.assert_allclose(mcmc.regularization(scene, CONFIG), expected, rtol=1e-4)
+    np.testing.assert_allclose(density.regularization(scene, CONFIG), expected, rtol=1e-4)
 
 
 opacities = st.lists(st.sampled_from([0.0, 0.004, 0.3, 0.9]), min_size=ROWS, max_size=ROWS)
-refine = jax.jit(mcmc.refine)
+refine = jax.jit(density.relocate)
 
 
 @given(opacities)
@@ -157,7 +157,7 @@ def test_gaussians_are_drawn_in_proportion_to_their_opacity():
     values = np.array([0.8, 0.4, 0.2, 0.0] + [1e-7] * 2000)
     scene = some_scene(values)
     rows = jnp.asarray(values == 1e-7)
-    after, _ = mcmc.respawn(scene, some_moments(scene), rows, CONFIG, key=KEY)
+    after, _ = density.respawn(scene, some_moments(scene), rows, CONFIG, key=KEY)
     moved, stood = np.asarray(after.means)[np.asarray(rows)], np.asarray(scene.means)
     counts = np.array([(moved == stood[i]).all(axis=1).sum() for i in range(4)])
     assert counts.sum() == 2000

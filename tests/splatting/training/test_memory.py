@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import pytest
 
 from r3jax.geometry.cameras import Camera
-from r3jax.splatting.config import RasterConfig
+from r3jax.splatting.backend import RasterConfig
 from r3jax.splatting.errors import TooLargeError
 from r3jax.splatting.scene import empty_scene
 from r3jax.splatting.training.config import TrainConfig
-from r3jax.splatting.training.memory import _free_on_host, check_memory, free_bytes, training_bytes
+from r3jax.splatting.training.train import _free_on_host, check_memory, free_bytes, training_bytes
 from r3jax.splatting.training.train_step import start_state, train_step
 from r3jax.splatting.views import Views
 
@@ -143,7 +143,7 @@ def test_a_device_says_itself_what_is_free(stats, expected):
 
 
 def test_where_nobody_can_tell_nothing_is_refused(monkeypatch):
-    monkeypatch.setattr("r3jax.splatting.training.memory.free_bytes", lambda: None)
+    monkeypatch.setattr("r3jax.splatting.training.train.free_bytes", lambda: None)
     check_memory(make_views(), config_of(10**9))
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from r3jax.splatting.config import RasterConfig
+from r3jax.splatting.backend import RasterConfig
 from r3jax.splatting.errors import TooLargeError, TrainingDiverged, ViewsError
 from r3jax.splatting.scene import GaussianScene
 from r3jax.splatting.training import train_step as steps

@@ -1,7 +1,7 @@
 """The corridor: a long passage with three offices, an archive and a lounge along it."""
 
 from r3jax.simulators.scenes.procedural.floorplan import FloorPlan
-from r3jax.simulators.scenes.procedural.furniture import decor, objects, seating, storage, workplace
+from r3jax.simulators.scenes.procedural.furniture import objects, pieces
 from r3jax.simulators.scenes.procedural.materials import finishes as f
 from r3jax.simulators.scenes.procedural.materials.finishes import BERBER, NORDIC, PERSIAN
 from r3jax.simulators.scenes.procedural.model import Model, assemble
@@ -68,7 +68,7 @@ def plan() -> FloorPlan:
 def _corridor(m: Model) -> None:
     for k, x in enumerate((2.3, 3.5, 7.2, 8.4, 12.0, 13.1)):
         m.put(
-            decor.picture(("poster", "landscape", "abstract")[k % 3], 110 + k, 0.5, 0.65, 1.65),
+            objects.picture(("poster", "landscape", "abstract")[k % 3], 110 + k, 0.5, 0.65, 1.65),
             x,
             1.9,
             0,
@@ -76,17 +76,17 @@ def _corridor(m: Model) -> None:
         )
     for k, x in enumerate((1.2, 2.6, 7.6, 9.2)):
         m.put(
-            decor.picture(("sunset", "poster", "abstract", "poster")[k], 120 + k, 0.7, 0.5, 1.65),
+            objects.picture(("sunset", "poster", "abstract", "poster")[k], 120 + k, 0.7, 0.5, 1.65),
             x,
             0.0,
             0,
             "n",
         )
-    m.put(seating.bench(1.3, f.wood(f.OAK, 12), f.leather(f.TEAL, 8)), 8.4, 0.28)
+    m.put(pieces.bench(1.3, f.wood(f.OAK, 12), f.leather(f.TEAL, 8)), 8.4, 0.28)
     m.put(objects.leafy_plant(1.1, 6, 34), 13.6, 0.4)
-    m.put(decor.wall_mirror(0.8, 1.4, 1.45), 0.0, 0.95, 0, "e")
-    m.put(decor.clock(8, 2.2), 4.3, 0.0, 0, "n")
-    m.put(decor.radiator(1.0), 3.6, 0.0, 0, "n")
+    m.put(objects.wall_mirror(0.8, 1.4, 1.45), 0.0, 0.95, 0, "e")
+    m.put(objects.clock(8, 2.2), 4.3, 0.0, 0, "n")
+    m.put(objects.radiator(1.0), 3.6, 0.0, 0, "n")
     for x in (2.3, 7.0, 11.7):
         m.put(objects.ceiling_panel(2.6, 1.2, 0.3, 2.2), x, 0.95)
 
@@ -94,64 +94,62 @@ def _corridor(m: Model) -> None:
 def _offices(m: Model) -> None:
     for k, x0 in enumerate((0.0, 4.72, 9.42)):
         x1 = x0 + 4.58
-        m.put(workplace.workstation(20 + k, 1.7), x0 + 1.0, 5.4, 0, "s") if k != 1 else m.put(
-            workplace.desk_island(1, 24), x0 + 2.7, 4.3, 0, 90.0
+        m.put(pieces.workstation(20 + k, 1.7), x0 + 1.0, 5.4, 0, "s") if k != 1 else m.put(
+            pieces.desk_island(1, 24), x0 + 2.7, 4.3, 0, 90.0
         )
         m.put(
-            storage.bookshelf(1.5, 2.1, f.wood((f.OAK, f.WALNUT, f.BEECH)[k], 2), 70 + k),
+            pieces.bookshelf(1.5, 2.1, f.wood((f.OAK, f.WALNUT, f.BEECH)[k], 2), 70 + k),
             x1,
             3.2,
             0,
             "w",
         )
-        m.put(workplace.filing_cabinet(k), x1, 4.9, 0, "w")
-        m.put(decor.radiator(1.4), x0 + 3.0, 5.4, 0, "s")
-        m.put(decor.board("white", 1.4, 0.9, 1.55, 30 + k), x0, 4.0, 0, "e")
+        m.put(pieces.filing_cabinet(k), x1, 4.9, 0, "w")
+        m.put(objects.radiator(1.4), x0 + 3.0, 5.4, 0, "s")
+        m.put(objects.board("white", 1.4, 0.9, 1.55, 30 + k), x0, 4.0, 0, "e")
         m.put(objects.leafy_plant(1.2, 3 + k, 34), x0 + 0.45, 2.5)
-        m.put(decor.picture("landscape", 130 + k, 0.8, 0.55), x0 + 3.0, 2.02, 0, "n")
-        m.put(decor.rug(1.8, 1.3, (NORDIC, BERBER, PERSIAN)[k], 20 + k), x0 + 2.2, 3.4)
+        m.put(objects.picture("landscape", 130 + k, 0.8, 0.55), x0 + 3.0, 2.02, 0, "n")
+        m.put(objects.rug(1.8, 1.3, (NORDIC, BERBER, PERSIAN)[k], 20 + k), x0 + 2.2, 3.4)
         m.put(objects.ceiling_panel(2.6, 1.2, 0.6, 2.3), x0 + 2.3, 3.8)
 
 
 def _archive(m: Model) -> None:
     steel = f.enamel((0.5, 0.55, 0.58), 6, 0.25)
     for k, x in enumerate((1.5, 4.4)):
-        m.put(storage.library_shelf(1.9, 2.1, steel, 80 + 4 * k, 2.6), x, -2.3, 0, 90.0)
-    m.put(storage.bookshelf(2.4, 2.1, steel, 90, thickness=2.6), 6.4, -1.9, 0, "w")
-    m.put(workplace.filing_cabinet(1), 3.5, -3.4, 0, "n")
-    m.put(workplace.filing_cabinet(2), 2.5, -3.4, 0, "n")
-    m.put(workplace.copier(), 0.0, -0.9, 0, "e")
+        m.put(pieces.library_shelf(1.9, 2.1, steel, 80 + 4 * k, 2.6), x, -2.3, 0, 90.0)
+    m.put(pieces.bookshelf(2.4, 2.1, steel, 90, thickness=2.6), 6.4, -1.9, 0, "w")
+    m.put(pieces.filing_cabinet(1), 3.5, -3.4, 0, "n")
+    m.put(pieces.filing_cabinet(2), 2.5, -3.4, 0, "n")
+    m.put(pieces.copier(), 0.0, -0.9, 0, "e")
     for k in range(3):
         m.put(objects.carton(k, 0.4, 0.35, 0.32), 0.35, -3.0 + 0.02 * k, 0.32 * k, 10.0 * k)
-    m.put(decor.picture("poster", 140, 0.5, 0.7, 1.85), 3.0, -3.4, 0, "n")
+    m.put(objects.picture("poster", 140, 0.5, 0.7, 1.85), 3.0, -3.4, 0, "n")
     m.put(objects.ceiling_panel(2.6, 1.2, 0.3, 2.2), 2.5, -2.0)
     m.put(objects.ceiling_panel(2.6, 1.2, 0.3, 2.2), 5.2, -1.6)
 
 
 def _lounge(m: Model) -> None:
     pillows = (f.fabric(f.MUSTARD, 6), f.striped((f.TEAL, f.CREAM), 14))
-    m.put(seating.sofa(2.2, f.fabric((0.32, 0.42, 0.4), 6), pillows, 4), 6.52, -2.2, 0, "e")
-    m.put(decor.rug(2.4, 1.7, PERSIAN, 25), 8.6, -2.2)
-    m.put(seating.coffee_table(f.wood(f.WALNUT, 12), 9), 8.1, -2.2, 0, "e")
-    m.put(
-        seating.armchair(f.leather((0.5, 0.3, 0.2), 9), f.fabric(f.CREAM, 4)), 8.2, -0.2, 0, 180.0
-    )
-    m.put(workplace.meeting_table(2.0, 1.0, 3, 2), 12.3, -1.9)
+    m.put(pieces.sofa(2.2, f.fabric((0.32, 0.42, 0.4), 6), pillows, 4), 6.52, -2.2, 0, "e")
+    m.put(objects.rug(2.4, 1.7, PERSIAN, 25), 8.6, -2.2)
+    m.put(pieces.coffee_table(f.wood(f.WALNUT, 12), 9), 8.1, -2.2, 0, "e")
+    m.put(pieces.armchair(f.leather((0.5, 0.3, 0.2), 9), f.fabric(f.CREAM, 4)), 8.2, -0.2, 0, 180.0)
+    m.put(pieces.meeting_table(2.0, 1.0, 3, 2), 12.3, -1.9)
     m.put(objects.pendant(2.6, 0.45, 0.28, 1, 2.4), 12.3, -1.9)
     m.put(objects.pendant(2.6, 0.45, 0.28, 2, 2.4), 8.6, -2.0)
     m.put(
-        decor.curtains(2.4, 2.4, f.printed(f.CREAM, (f.TERRACOTTA, f.SAGE), "damask", 23)),
+        objects.curtains(2.4, 2.4, f.printed(f.CREAM, (f.TERRACOTTA, f.SAGE), "damask", 23)),
         9.0,
         -3.4,
         0,
         "n",
     )
-    m.put(decor.board("white", 1.8, 1.1, 1.5, 35), 14.0, -1.9, 0, "w")
-    m.put(decor.picture_group(142, 1.7), 6.52, -2.2, 0, "e")
+    m.put(objects.board("white", 1.8, 1.1, 1.5, 35), 14.0, -1.9, 0, "w")
+    m.put(objects.picture_group(142, 1.7), 6.52, -2.2, 0, "e")
     m.put(objects.floor_lamp(0), 6.9, -0.6)
     m.put(objects.leafy_plant(1.5, 2, 44), 7.0, -2.95)
-    m.put(decor.picture("sunset", 147, 1.0, 0.7), 12.3, -3.4, 0, "n")
-    m.put(storage.sideboard(1.3, f.wood(f.WALNUT, 13), 11), 13.2, -0.12, 0, "s")
+    m.put(objects.picture("sunset", 147, 1.0, 0.7), 12.3, -3.4, 0, "n")
+    m.put(pieces.sideboard(1.3, f.wood(f.WALNUT, 13), 11), 13.2, -0.12, 0, "s")
 
 
 def build() -> World:

@@ -1,7 +1,7 @@
 """The gallery: three halls with pictures, sculptures, benches and a large mirror."""
 
 from r3jax.simulators.scenes.procedural.floorplan import FloorPlan
-from r3jax.simulators.scenes.procedural.furniture import decor, objects, seating, storage, workplace
+from r3jax.simulators.scenes.procedural.furniture import objects, pieces
 from r3jax.simulators.scenes.procedural.materials import finishes as f
 from r3jax.simulators.scenes.procedural.materials.finishes import CHIPS, PERSIAN
 from r3jax.simulators.scenes.procedural.model import Model, assemble
@@ -51,11 +51,11 @@ def plan() -> FloorPlan:
 
 def _red_hall(m: Model) -> None:
     gilt = f.enamel((0.72, 0.58, 0.3), 4, 0.6)
-    m.put(decor.picture("landscape", 90, 1.7, 1.2, 1.75, gilt), 2.0, 6.0, 0, "s")
-    m.put(decor.picture("sunset", 91, 1.2, 0.9, 1.75, gilt), 4.6, 6.0, 0, "s")
+    m.put(objects.picture("landscape", 90, 1.7, 1.2, 1.75, gilt), 2.0, 6.0, 0, "s")
+    m.put(objects.picture("sunset", 91, 1.2, 0.9, 1.75, gilt), 4.6, 6.0, 0, "s")
     for k, y in enumerate((1.2, 2.9, 4.6)):
         m.put(
-            decor.picture(
+            objects.picture(
                 ("sunset", "landscape", "sunset")[k],
                 92 + k,
                 0.9 + 0.3 * (k == 1),
@@ -68,59 +68,59 @@ def _red_hall(m: Model) -> None:
             0,
             "e",
         )
-    m.put(decor.wall_mirror(1.8, 1.6, 1.75, gilt), 2.2, 0.0, 0, "n")
-    m.put(decor.picture("landscape", 96, 0.8, 0.6, 1.8, gilt), 4.6, 0.0, 0, "n")
-    m.put(decor.picture("abstract", 31, 0.7, 0.95, 1.8, gilt), 6.4, 3.6, 0, "w")
-    m.put(seating.bench(1.6, f.wood(f.WALNUT, 11), f.leather((0.3, 0.1, 0.1), 6)), 3.2, 4.2)
-    m.put(decor.rug(3.0, 2.0, PERSIAN, 18), 3.2, 3.0)
-    m.put(seating.plinth_sculpture(2, f.marble((0.9, 0.89, 0.86), (0.5, 0.5, 0.5), 79)), 1.1, 5.1)
-    m.put(seating.plinth_sculpture(1, gilt), 5.5, 0.8)
-    m.put(storage.sideboard(1.5, f.wood(f.WALNUT, 11), 9), 4.4, 0.0, 0, "n")
+    m.put(objects.wall_mirror(1.8, 1.6, 1.75, gilt), 2.2, 0.0, 0, "n")
+    m.put(objects.picture("landscape", 96, 0.8, 0.6, 1.8, gilt), 4.6, 0.0, 0, "n")
+    m.put(objects.picture("abstract", 31, 0.7, 0.95, 1.8, gilt), 6.4, 3.6, 0, "w")
+    m.put(pieces.bench(1.6, f.wood(f.WALNUT, 11), f.leather((0.3, 0.1, 0.1), 6)), 3.2, 4.2)
+    m.put(objects.rug(3.0, 2.0, PERSIAN, 18), 3.2, 3.0)
+    m.put(pieces.plinth_sculpture(2, f.marble((0.9, 0.89, 0.86), (0.5, 0.5, 0.5), 79)), 1.1, 5.1)
+    m.put(pieces.plinth_sculpture(1, gilt), 5.5, 0.8)
+    m.put(pieces.sideboard(1.5, f.wood(f.WALNUT, 11), 9), 4.4, 0.0, 0, "n")
     m.put(objects.leafy_plant(1.4, 2, 40), 0.5, 0.5)
-    m.put(workplace.spotlight_rail(4.4, 3.0, 3), 3.2, 4.7)
-    m.put(workplace.spotlight_rail(4.4, 3.0, 3), 3.2, 1.3, 0, 180.0)
+    m.put(pieces.spotlight_rail(4.4, 3.0, 3), 3.2, 4.7)
+    m.put(pieces.spotlight_rail(4.4, 3.0, 3), 3.2, 1.3, 0, 180.0)
 
 
 def _white_hall(m: Model) -> None:
     white = f.enamel(f.WHITE, 3, 0.2)
     for k, x in enumerate((7.5, 8.9)):
-        m.put(decor.picture("abstract", 40 + k, 0.9, 1.2, 1.6, white), x, 4.4, 0, "s")
-    m.put(decor.picture("abstract", 46, 1.9, 1.4, 1.6, white), 12.6, 2.2, 0, "w")
-    m.put(decor.picture("poster", 47, 0.8, 1.1, 1.6, white), 6.6, 3.4, 0, "e")
+        m.put(objects.picture("abstract", 40 + k, 0.9, 1.2, 1.6, white), x, 4.4, 0, "s")
+    m.put(objects.picture("abstract", 46, 1.9, 1.4, 1.6, white), 12.6, 2.2, 0, "w")
+    m.put(objects.picture("poster", 47, 0.8, 1.1, 1.6, white), 6.6, 3.4, 0, "e")
     for k, (x, y) in enumerate(((7.8, 0.9), (11.5, 0.9), (9.4, 2.9))):
         stone = (
             f.terrazzo((0.3, 0.32, 0.34), CHIPS, 80)
             if k % 2
             else f.marble((0.85, 0.72, 0.6), (0.5, 0.35, 0.25), 81)
         )
-        m.put(seating.plinth_sculpture(k + 2, stone), x, y)
-    m.put(seating.bench(1.4, f.wood(f.OAK, 10), f.fabric(f.CHARCOAL, 4)), 9.6, 0.6)
-    m.put(workplace.spotlight_rail(4.0, 3.0, 3), 9.4, 3.2)
-    m.put(workplace.spotlight_rail(4.0, 3.0, 2), 9.6, 1.2, 0, 180.0)
+        m.put(pieces.plinth_sculpture(k + 2, stone), x, y)
+    m.put(pieces.bench(1.4, f.wood(f.OAK, 10), f.fabric(f.CHARCOAL, 4)), 9.6, 0.6)
+    m.put(pieces.spotlight_rail(4.0, 3.0, 3), 9.4, 3.2)
+    m.put(pieces.spotlight_rail(4.0, 3.0, 2), 9.6, 1.2, 0, 180.0)
 
 
 def _blue_hall(m: Model) -> None:
     gilt, oak = f.enamel((0.72, 0.58, 0.3), 4, 0.6), f.wood(f.OAK, 11)
     for k, x in enumerate((7.5, 8.4, 9.3)):
         m.put(
-            decor.picture(("poster", "landscape", "abstract")[k], 100 + k, 0.6, 0.8, 1.6, gilt),
+            objects.picture(("poster", "landscape", "abstract")[k], 100 + k, 0.6, 0.8, 1.6, gilt),
             x,
             4.6,
             0,
             "n",
         )
-    m.put(decor.wall_mirror(1.4, 1.9, 1.45, gilt), 12.6, 6.6, 0, "w")
-    m.put(decor.picture("sunset", 105, 1.2, 0.9, 1.65, gilt), 10.6, 8.6, 0, "s")
-    m.put(decor.picture("landscape", 106, 1.0, 0.75, 1.65, gilt), 6.6, 7.3, 0, "e")
-    m.put(storage.bookshelf(1.4, 1.2, oak, 61), 11.8, 8.6, 0, "s")
-    m.put(seating.table(1.3, 0.7, oak, 0.8), 8.3, 6.6)
+    m.put(objects.wall_mirror(1.4, 1.9, 1.45, gilt), 12.6, 6.6, 0, "w")
+    m.put(objects.picture("sunset", 105, 1.2, 0.9, 1.65, gilt), 10.6, 8.6, 0, "s")
+    m.put(objects.picture("landscape", 106, 1.0, 0.75, 1.65, gilt), 6.6, 7.3, 0, "e")
+    m.put(pieces.bookshelf(1.4, 1.2, oak, 61), 11.8, 8.6, 0, "s")
+    m.put(pieces.table(1.3, 0.7, oak, 0.8), 8.3, 6.6)
     m.put(objects.vase(4, 0.4), 8.0, 6.6, 0.8)
-    m.put(workplace.globe(2), 8.55, 6.65, 0.8)
+    m.put(pieces.globe(2), 8.55, 6.65, 0.8)
     m.put(objects.book_pile(5, 12), 8.3, 6.45, 0.8)
-    m.put(seating.plinth_sculpture(3, gilt), 7.2, 8.0)
+    m.put(pieces.plinth_sculpture(3, gilt), 7.2, 8.0)
     m.put(objects.leafy_plant(1.3, 6, 38), 12.1, 5.1)
     m.put(
-        decor.curtains(1.4, 2.55, f.striped((f.NAVY, (0.6, 0.5, 0.3), f.NAVY), 12)),
+        objects.curtains(1.4, 2.55, f.striped((f.NAVY, (0.6, 0.5, 0.3), f.NAVY), 12)),
         8.6,
         8.6,
         0,

@@ -1,7 +1,7 @@
 """The kitchen-diner: a family kitchen with an island, a dining corner and a pantry."""
 
 from r3jax.simulators.scenes.procedural.floorplan import FloorPlan
-from r3jax.simulators.scenes.procedural.furniture import decor, kitchen, objects, seating, storage
+from r3jax.simulators.scenes.procedural.furniture import kitchen, objects, pieces
 from r3jax.simulators.scenes.procedural.materials import finishes as f
 from r3jax.simulators.scenes.procedural.materials.finishes import CHIPS, NORDIC
 from r3jax.simulators.scenes.procedural.model import Model, assemble
@@ -50,17 +50,17 @@ def _cooking(m: Model) -> None:
     m.put(kitchen.fridge(1), 0.5, 4.3, 0, "s")
     m.put(kitchen.island(1.5, f.wood(f.OAK, 2), stone, 2), 3.9, 2.2)
     for x in (3.5, 4.2):
-        m.put(seating.stool(f.wood(f.OAK, 2)), x, 1.55)
+        m.put(pieces.stool(f.wood(f.OAK, 2)), x, 1.55)
     for x in (3.5, 4.3):
         m.put(objects.pendant(2.6, 0.55, 0.15, 2, 1.7), x, 2.2)
-    m.put(decor.wall_shelf(1.3, 1.5, kitchen.kitchen_shelf(1)), 6.0, 3.2, 0, "w")
-    m.put(decor.wall_shelf(1.3, 1.95, kitchen.kitchen_shelf(7)), 6.0, 3.2, 0, "w")
+    m.put(objects.wall_shelf(1.3, 1.5, kitchen.kitchen_shelf(1)), 6.0, 3.2, 0, "w")
+    m.put(objects.wall_shelf(1.3, 1.95, kitchen.kitchen_shelf(7)), 6.0, 3.2, 0, "w")
 
 
 def _dining(m: Model) -> None:
-    m.put(decor.rug(1.9, 1.6, NORDIC, 2), 1.3, 1.3)
+    m.put(objects.rug(1.9, 1.6, NORDIC, 2), 1.3, 1.3)
     m.put(
-        seating.dining_set(
+        pieces.dining_set(
             1.2, 0.8, f.wood(f.PINE, 2), f.plaid(f.TERRACOTTA, f.CREAM, f.NAVY, 3), 5
         ),
         1.3,
@@ -68,7 +68,7 @@ def _dining(m: Model) -> None:
     )
     m.put(objects.pendant(2.6, 0.55, 0.25, 0), 1.3, 1.3)
     m.put(
-        decor.curtains(
+        objects.curtains(
             1.7, 2.35, f.printed(f.CREAM, (f.TERRACOTTA, f.MUSTARD, f.TEAL), "botanical", 17)
         ),
         1.6,
@@ -76,24 +76,24 @@ def _dining(m: Model) -> None:
         0,
         "n",
     )
-    m.put(storage.drawers(1.0, 0.85, 0.4, f.wood(f.PINE, 4), 2, 3), 3.7, 0.0, 0, "n")
+    m.put(pieces.drawers(1.0, 0.85, 0.4, f.wood(f.PINE, 4), 2, 3), 3.7, 0.0, 0, "n")
     m.put(objects.table_lamp(2), 3.4, 0.2, 0.85)
     m.put(objects.book_pile(5, 3), 3.75, 0.2, 0.85)
     m.put(objects.vase(7), 4.0, 0.2, 0.85)
-    m.put(decor.picture_group(50, 1.75), 3.8, 0.0, 0, "n")
+    m.put(objects.picture_group(50, 1.75), 3.8, 0.0, 0, "n")
     m.put(objects.leafy_plant(1.4, 4, 42), 5.45, 0.45)
-    m.put(decor.radiator(0.9), 0.0, 2.2, 0, "e")
-    m.put(decor.clock(2), 0.0, 3.2, 0, "e")
+    m.put(objects.radiator(0.9), 0.0, 2.2, 0, "e")
+    m.put(objects.clock(2), 0.0, 3.2, 0, "e")
 
 
 def _pantry(m: Model) -> None:
     shelves, rows = f.wood(f.PINE, 5), (0.35, 0.75, 1.15, 1.55, 1.95)
     for k, z in enumerate(rows):
-        m.put(decor.wall_shelf(2.4, z, kitchen.kitchen_shelf(11 * k, 2.4)), 8.0, 2.9, 0, "w")
-        m.put(decor.wall_shelf(1.6, z, kitchen.kitchen_shelf(5 + 7 * k, 1.6)), 7.05, 4.3, 0, "s")
-    m.put(storage.drawers(0.5, 0.9, 0.4, shelves, 1, 3), 6.12, 3.5, 0, "e")
+        m.put(objects.wall_shelf(2.4, z, kitchen.kitchen_shelf(11 * k, 2.4)), 8.0, 2.9, 0, "w")
+        m.put(objects.wall_shelf(1.6, z, kitchen.kitchen_shelf(5 + 7 * k, 1.6)), 7.05, 4.3, 0, "s")
+    m.put(pieces.drawers(0.5, 0.9, 0.4, shelves, 1, 3), 6.12, 3.5, 0, "e")
     m.put(objects.bowl_of_fruit(3), 6.32, 3.5, 0.9)
-    m.put(decor.picture("poster", 4, 0.4, 0.55), 6.12, 2.7, 0, "e")
+    m.put(objects.picture("poster", 4, 0.4, 0.55), 6.12, 2.7, 0, "e")
     m.put(objects.ceiling_panel(2.5, 0.6, 0.3, 1.8), 7.0, 2.3)
 
 

@@ -1,7 +1,7 @@
 """The library: a reading hall with shelves, a study and a foyer."""
 
 from r3jax.simulators.scenes.procedural.floorplan import FloorPlan
-from r3jax.simulators.scenes.procedural.furniture import decor, objects, seating, storage, workplace
+from r3jax.simulators.scenes.procedural.furniture import objects, pieces
 from r3jax.simulators.scenes.procedural.materials import finishes as f
 from r3jax.simulators.scenes.procedural.materials.finishes import NORDIC, PERSIAN
 from r3jax.simulators.scenes.procedural.model import Model, assemble
@@ -58,25 +58,25 @@ def plan() -> FloorPlan:
 def _hall(m: Model) -> None:
     wood = f.wood(f.WALNUT, 14)
     for k, x in enumerate((1.5, 3.6, 5.7)):
-        m.put(storage.library_shelf(2.4, 2.0, wood, 200 + 4 * k, 1.25), x, 1.95, 0, 90.0)
+        m.put(pieces.library_shelf(2.4, 2.0, wood, 200 + 4 * k, 1.25), x, 1.95, 0, 90.0)
     for k, y in enumerate((1.2, 3.4)):
-        m.put(storage.bookshelf(1.8, 2.4, wood, 220 + k), 0.0, y, 0, "e")
-    m.put(storage.bookshelf(2.0, 2.4, wood, 224), 8.2, 7.6, 0, "s")
-    m.put(storage.bookshelf(1.8, 2.4, wood, 226), 9.6, 2.9, 0, "w")
+        m.put(pieces.bookshelf(1.8, 2.4, wood, 220 + k), 0.0, y, 0, "e")
+    m.put(pieces.bookshelf(2.0, 2.4, wood, 224), 8.2, 7.6, 0, "s")
+    m.put(pieces.bookshelf(1.8, 2.4, wood, 226), 9.6, 2.9, 0, "w")
     for k, x in enumerate((2.2, 5.2)):
-        m.put(seating.table(1.8, 0.9, f.wood(f.OAK, 14)), x, 5.7)
+        m.put(pieces.table(1.8, 0.9, f.wood(f.OAK, 14)), x, 5.7)
         for dx, dy, turn in (
             (-0.45, -0.6, 8.0),
             (0.4, -0.65, -6.0),
             (-0.4, 0.62, 174.0),
             (0.45, 0.66, 190.0),
         ):
-            m.put(seating.chair(wood, f.leather((0.24, 0.35, 0.28), 11)), x + dx, 5.7 + dy, 0, turn)
+            m.put(pieces.chair(wood, f.leather((0.24, 0.35, 0.28), 11)), x + dx, 5.7 + dy, 0, turn)
         m.put(objects.table_lamp(2 + k, 0.42), x, 5.7, 0.74)
         m.put(objects.book_pile(4, 30 + k), x - 0.55, 5.65, 0.74, 20.0)
         m.put(objects.book_pile(3, 40 + k), x + 0.5, 5.85, 0.74, -15.0)
     m.put(
-        seating.armchair(
+        pieces.armchair(
             f.leather((0.42, 0.22, 0.14), 12), f.plaid(f.NAVY, f.CREAM, f.TERRACOTTA, 11)
         ),
         7.6,
@@ -84,39 +84,43 @@ def _hall(m: Model) -> None:
         0,
         135.0,
     )
-    m.put(decor.rug(1.9, 1.4, PERSIAN, 30), 7.5, 5.2)
+    m.put(objects.rug(1.9, 1.4, PERSIAN, 30), 7.5, 5.2)
     m.put(objects.floor_lamp(0), 9.25, 4.1)
-    m.put(workplace.globe(6), 8.95, 0.4)
+    m.put(pieces.globe(6), 8.95, 0.4)
     m.put(objects.leafy_plant(1.6, 4, 46), 0.5, 7.1)
     m.put(objects.leafy_plant(1.3, 2, 40), 9.1, 0.5)
-    m.put(decor.picture("landscape", 170, 1.2, 0.8, 1.9), 0.0, 5.8, 0, "e")
-    m.put(decor.picture("sunset", 171, 1.3, 0.9, 1.9), 7.7, 0.0, 0, "n")
-    m.put(decor.picture("poster", 172, 0.6, 0.85, 1.8), 3.5, 7.6, 0, "s")
+    m.put(objects.picture("landscape", 170, 1.2, 0.8, 1.9), 0.0, 5.8, 0, "e")
+    m.put(objects.picture("sunset", 171, 1.3, 0.9, 1.9), 7.7, 0.0, 0, "n")
+    m.put(objects.picture("poster", 172, 0.6, 0.85, 1.8), 3.5, 7.6, 0, "s")
     for x, y in ((2.4, 2.4), (6.8, 2.4), (2.2, 5.7), (5.2, 5.7), (7.6, 5.2)):
         m.put(objects.pendant(3.0, 0.55, 0.26, 3, 2.2), x, y)
 
 
 def _study(m: Model) -> None:
-    m.put(storage.desk(1.5, f.wood(f.WALNUT, 15), 33, 1), 11.4, 0.0, 0, "n")
-    m.put(seating.office_chair(f.leather((0.3, 0.17, 0.12), 13)), 11.4, 1.0, 0, 170.0)
-    m.put(storage.bookshelf(1.2, 2.1, f.wood(f.WALNUT, 15), 232), 9.72, 2.6, 0, "e")
-    m.put(decor.rug(1.6, 1.2, NORDIC, 31), 11.2, 2.3)
-    m.put(decor.curtains(1.4, 2.4, f.striped((f.SAGE, f.CREAM, f.MUSTARD), 16)), 12.8, 1.7, 0, "w")
-    m.put(decor.picture_group(175, 1.75), 10.6, 3.6, 0, "s")
+    m.put(pieces.desk(1.5, f.wood(f.WALNUT, 15), 33, 1), 11.4, 0.0, 0, "n")
+    m.put(pieces.office_chair(f.leather((0.3, 0.17, 0.12), 13)), 11.4, 1.0, 0, 170.0)
+    m.put(pieces.bookshelf(1.2, 2.1, f.wood(f.WALNUT, 15), 232), 9.72, 2.6, 0, "e")
+    m.put(objects.rug(1.6, 1.2, NORDIC, 31), 11.2, 2.3)
+    m.put(
+        objects.curtains(1.4, 2.4, f.striped((f.SAGE, f.CREAM, f.MUSTARD), 16)), 12.8, 1.7, 0, "w"
+    )
+    m.put(objects.picture_group(175, 1.75), 10.6, 3.6, 0, "s")
     m.put(objects.pendant(2.7, 0.45, 0.22, 1, 2.0), 11.2, 1.8)
     m.put(objects.leafy_plant(1.1, 6, 34), 10.15, 0.45)
 
 
 def _foyer(m: Model) -> None:
-    m.put(decor.wall_mirror(1.2, 1.7, 1.5, f.enamel((0.72, 0.58, 0.3), 4, 0.6)), 12.8, 6.3, 0, "w")
-    m.put(decor.coat_rack(1), 9.72, 7.0 - 0.0, 0, "e")
-    m.put(seating.bench(1.3, f.wood(f.OAK, 15), f.leather(f.TEAL, 14)), 12.45, 5.0, 0, "w")
-    m.put(storage.drawers(1.0, 0.95, 0.42, f.wood(f.OAK, 15), 2, 4), 9.72, 4.35, 0, "e")
+    m.put(
+        objects.wall_mirror(1.2, 1.7, 1.5, f.enamel((0.72, 0.58, 0.3), 4, 0.6)), 12.8, 6.3, 0, "w"
+    )
+    m.put(objects.coat_rack(1), 9.72, 7.0 - 0.0, 0, "e")
+    m.put(pieces.bench(1.3, f.wood(f.OAK, 15), f.leather(f.TEAL, 14)), 12.45, 5.0, 0, "w")
+    m.put(pieces.drawers(1.0, 0.95, 0.42, f.wood(f.OAK, 15), 2, 4), 9.72, 4.35, 0, "e")
     m.put(objects.vase(2, 0.36), 9.95, 4.1, 0.95)
-    m.put(workplace.globe(8), 9.95, 4.55, 0.95)
-    m.put(decor.picture("poster", 180, 0.7, 0.95, 1.7), 10.6, 3.72, 0, "n")
-    m.put(seating.plinth_sculpture(5, f.marble((0.9, 0.89, 0.86), (0.5, 0.5, 0.5), 79)), 12.2, 7.1)
-    m.put(decor.radiator(1.2), 11.2, 7.6, 0, "s")
+    m.put(pieces.globe(8), 9.95, 4.55, 0.95)
+    m.put(objects.picture("poster", 180, 0.7, 0.95, 1.7), 10.6, 3.72, 0, "n")
+    m.put(pieces.plinth_sculpture(5, f.marble((0.9, 0.89, 0.86), (0.5, 0.5, 0.5), 79)), 12.2, 7.1)
+    m.put(objects.radiator(1.2), 11.2, 7.6, 0, "s")
     m.put(objects.pendant(2.7, 0.45, 0.26, 4, 2.2), 11.2, 5.6)
 
 

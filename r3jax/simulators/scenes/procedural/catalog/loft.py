@@ -3,14 +3,7 @@
 import numpy as np
 
 from r3jax.simulators.scenes.procedural.floorplan import FloorPlan
-from r3jax.simulators.scenes.procedural.furniture import (
-    decor,
-    kitchen,
-    objects,
-    seating,
-    storage,
-    workplace,
-)
+from r3jax.simulators.scenes.procedural.furniture import kitchen, objects, pieces
 from r3jax.simulators.scenes.procedural.materials import finishes as f
 from r3jax.simulators.scenes.procedural.materials.finishes import BERBER, PERSIAN
 from r3jax.simulators.scenes.procedural.model import Model, assemble
@@ -83,22 +76,22 @@ def _structure(m: Model) -> None:
 def _live(m: Model) -> None:
     hide = f.leather((0.45, 0.27, 0.16), 7)
     pillows = (f.plaid(f.CREAM, f.NAVY, f.TERRACOTTA, 8), f.fabric(f.MUSTARD, 4))
-    m.put(seating.sofa(2.3, hide, pillows, 6), 5.0, 1.55, 0, "w")
-    m.put(decor.rug(2.6, 1.9, PERSIAN, 12), 3.1, 1.5)
-    m.put(seating.coffee_table(f.wood(f.EBONY, 4), 8, 1.1), 3.3, 1.55, 0, "e")
+    m.put(pieces.sofa(2.3, hide, pillows, 6), 5.0, 1.55, 0, "w")
+    m.put(objects.rug(2.6, 1.9, PERSIAN, 12), 3.1, 1.5)
+    m.put(pieces.coffee_table(f.wood(f.EBONY, 4), 8, 1.1), 3.3, 1.55, 0, "e")
     m.put(
-        seating.armchair(f.fabric(f.TEAL, 5), f.striped((f.MUSTARD, f.CREAM), 9)),
+        pieces.armchair(f.fabric(f.TEAL, 5), f.striped((f.MUSTARD, f.CREAM), 9)),
         1.9,
         0.45,
         0,
         15.0,
     )
-    m.put(storage.television_unit(1.7, f.wood(f.WALNUT, 7), 2), 0.0, 1.9, 0, "e")
+    m.put(pieces.television_unit(1.7, f.wood(f.WALNUT, 7), 2), 0.0, 1.9, 0, "e")
     m.put(objects.floor_lamp(1), 5.3, 0.35)
     m.put(objects.leafy_plant(1.6, 5, 46), 0.5, 0.5)
-    m.put(storage.library_shelf(1.5, 1.15, f.wood(f.OAK, 6), 40), 3.0, 4.75, 0, 90.0)
+    m.put(pieces.library_shelf(1.5, 1.15, f.wood(f.OAK, 6), 40), 3.0, 4.75, 0, 90.0)
     m.put(
-        seating.bed(
+        pieces.bed(
             1.6,
             f.printed((0.5, 0.53, 0.55), ((0.6, 0.62, 0.64), f.CREAM), "damask", 10),
             f.plaid(f.TERRACOTTA, f.CREAM, f.CHARCOAL, 9),
@@ -109,8 +102,8 @@ def _live(m: Model) -> None:
         0,
         "s",
     )
-    m.put(storage.nightstand(f.wood(f.WALNUT, 8), 8), 2.45, 6.4, 0, "s")
-    m.put(decor.picture("abstract", 12, 1.2, 0.9, 1.75), 1.35, 6.4, 0, "s")
+    m.put(pieces.nightstand(f.wood(f.WALNUT, 8), 8), 2.45, 6.4, 0, "s")
+    m.put(objects.picture("abstract", 12, 1.2, 0.9, 1.75), 1.35, 6.4, 0, "s")
     for x, seed in ((1.5, 0), (4.4, 2), (7.4, 5)):
         m.put(objects.pendant(2.78, 0.5, 0.28, seed, 2.4), x, 3.0)
 
@@ -130,19 +123,19 @@ def _cook_and_work(m: Model) -> None:
     m.put(kitchen.fridge(6), 7.6, 6.4, 0, "s")
     m.put(kitchen.island(1.6, f.wood(f.WALNUT, 9), top, 7), 5.4, 4.4)
     for x in (4.9, 5.7):
-        m.put(seating.stool(f.metal((0.32, 0.33, 0.34), 3, 0.05)), x, 3.75)
+        m.put(pieces.stool(f.metal((0.32, 0.33, 0.34), 3, 0.05)), x, 3.75)
     m.put(
-        seating.dining_set(1.6, 0.9, f.wood(f.EBONY, 6), f.leather((0.5, 0.33, 0.22), 5), 8),
+        pieces.dining_set(1.6, 0.9, f.wood(f.EBONY, 6), f.leather((0.5, 0.33, 0.22), 5), 8),
         7.2,
         1.6,
     )
     m.put(objects.pendant(2.78, 0.6, 0.3, 3, 2.2), 7.2, 1.6)
-    m.put(decor.board("black", 1.4, 0.9, 1.6, 6), 9.0, 2.8, 0, "w")
-    m.put(decor.picture("poster", 9, 0.7, 1.0, 1.7), 9.0, 5.7, 0, "w")
-    m.put(storage.drawers(1.0, 0.9, 0.42, f.enamel(f.MUSTARD, 5, 0.3), 2, 3), 8.5, 6.4, 0, "s")
+    m.put(objects.board("black", 1.4, 0.9, 1.6, 6), 9.0, 2.8, 0, "w")
+    m.put(objects.picture("poster", 9, 0.7, 1.0, 1.7), 9.0, 5.7, 0, "w")
+    m.put(pieces.drawers(1.0, 0.9, 0.42, f.enamel(f.MUSTARD, 5, 0.3), 2, 3), 8.5, 6.4, 0, "s")
     m.put(objects.vase(6, 0.35), 8.3, 6.2, 0.9)
     m.put(objects.clutter(12), 8.7, 6.2, 0.9)
-    m.put(workplace.globe(3), 8.5, 6.2, 0.9)
+    m.put(pieces.globe(3), 8.5, 6.2, 0.9)
 
 
 def _side_rooms(m: Model) -> None:
@@ -151,11 +144,11 @@ def _side_rooms(m: Model) -> None:
     m.put(kitchen.washbasin(0.8, f.wood(f.OAK, 7), 6), 11.5, 5.0, 0, "w")
     m.put(kitchen.towel_rail(6), 9.12, 5.4, 0, "e")
     m.put(objects.ceiling_panel(2.6, 0.5, 0.5, 2.0), 10.2, 4.6)
-    m.put(storage.wardrobe(2.0, 2.2, f.wood(f.OAK, 9)), 11.5, 1.7, 0, "w")
-    m.put(storage.wardrobe(1.4, 2.2, f.enamel(f.SAGE, 5, 0.2), False), 10.0, 3.38, 0, "s")
-    m.put(decor.coat_rack(2), 10.2, 0.0, 0, "n")
-    m.put(decor.rug(1.3, 1.0, BERBER, 14), 10.1, 1.5)
-    m.put(seating.bench(0.9, f.wood(f.OAK, 9), f.fabric(f.BLUSH, 3)), 9.8, 0.4)
+    m.put(pieces.wardrobe(2.0, 2.2, f.wood(f.OAK, 9)), 11.5, 1.7, 0, "w")
+    m.put(pieces.wardrobe(1.4, 2.2, f.enamel(f.SAGE, 5, 0.2), False), 10.0, 3.38, 0, "s")
+    m.put(objects.coat_rack(2), 10.2, 0.0, 0, "n")
+    m.put(objects.rug(1.3, 1.0, BERBER, 14), 10.1, 1.5)
+    m.put(pieces.bench(0.9, f.wood(f.OAK, 9), f.fabric(f.BLUSH, 3)), 9.8, 0.4)
     m.put(objects.pendant(2.6, 0.35, 0.2, 4, 1.9), 10.1, 1.6)
 
 

@@ -8,7 +8,7 @@ import functools
 import numpy as np
 
 from r3jax.errors import InputError
-from r3jax.simulators.scenes.procedural.materials import artwork, patterns, textures
+from r3jax.simulators.scenes.procedural.materials import artwork, textures
 from r3jax.simulators.scenes.procedural.materials.textures import Color, Real
 from r3jax.simulators.scenes.procedural.model import Finish
 from r3jax.simulators.world import Material
@@ -45,7 +45,7 @@ def plaster(color: Color, seed: int, strength: Real = 1.0) -> Finish:
 @functools.cache
 def wallpaper(ground: Color, inks: tuple[Color, ...], motif: str, seed: int) -> Finish:
     """Makes the finish of printed wallpaper."""
-    return Finish(Material(patterns.wallpaper(ground, inks, motif, seed)), (1.9, 1.9))
+    return Finish(Material(textures.wallpaper(ground, inks, motif, seed)), (1.9, 1.9))
 
 
 @functools.cache
@@ -140,55 +140,55 @@ def enamel(color: Color, seed: int = 0, gloss: Real = 0.4) -> Finish:
 @functools.cache
 def fabric(color: Color, seed: int = 0) -> Finish:
     """Makes the finish of plain woven cloth."""
-    return Finish(Material(patterns.fabric(color, seed)), (0.7, 0.7))
+    return Finish(Material(textures.fabric(color, seed)), (0.7, 0.7))
 
 
 @functools.cache
 def striped(colors: tuple[Color, ...], seed: int = 0, repeats: int = 4) -> Finish:
     """Makes the finish of striped cloth."""
-    return Finish(Material(patterns.stripes(colors, seed, repeats)), (0.9, 0.9))
+    return Finish(Material(textures.stripes(colors, seed, repeats)), (0.9, 0.9))
 
 
 @functools.cache
 def plaid(ground: Color, first: Color, second: Color, seed: int = 0) -> Finish:
     """Makes the finish of tartan cloth."""
-    return Finish(Material(patterns.plaid(ground, first, second, seed)), (0.8, 0.8))
+    return Finish(Material(textures.plaid(ground, first, second, seed)), (0.8, 0.8))
 
 
 @functools.cache
 def printed(ground: Color, inks: tuple[Color, ...], motif: str, seed: int) -> Finish:
     """Makes the finish of printed cloth for curtains and cushions."""
-    return Finish(Material(patterns.wallpaper(ground, inks, motif, seed, 512)), (0.9, 0.9))
+    return Finish(Material(textures.wallpaper(ground, inks, motif, seed, 512)), (0.9, 0.9))
 
 
 @functools.cache
 def leather(color: Color, seed: int = 0) -> Finish:
     """Makes the finish of upholstery leather."""
-    return Finish(Material(patterns.leather(color, seed), specular=0.3, shininess=20.0), (0.8, 0.8))
+    return Finish(Material(textures.leather(color, seed), specular=0.3, shininess=20.0), (0.8, 0.8))
 
 
 @functools.cache
 def carpet(color: Color, fleck: Color, seed: int = 0) -> Finish:
     """Makes the finish of fitted carpet."""
-    return Finish(Material(patterns.carpet(color, fleck, seed)), (2.0, 2.0))
+    return Finish(Material(textures.carpet(color, fleck, seed)), (2.0, 2.0))
 
 
 @functools.cache
 def rug(palette: tuple[Color, ...], seed: int) -> Finish:
     """Makes the finish of a knotted rug, fitted once."""
-    return Finish(Material(patterns.rug(palette, seed)))
+    return Finish(Material(textures.rug(palette, seed)))
 
 
 @functools.cache
 def leaf(color: Color, seed: int = 0) -> Finish:
     """Makes the finish of a leaf, fitted once."""
-    return Finish(Material(patterns.leaf(color, seed), specular=0.15, shininess=16.0))
+    return Finish(Material(textures.leaf(color, seed), specular=0.15, shininess=16.0))
 
 
 @functools.cache
 def glow(color: Color, seed: int = 0, emission: Real = 0.95) -> Finish:
     """Makes the finish of a lamp shade or diffuser that shines by itself."""
-    return Finish(Material(patterns.fabric(color, seed, 64), emission=emission), (0.5, 0.5))
+    return Finish(Material(textures.fabric(color, seed, 64), emission=emission), (0.5, 0.5))
 
 
 @functools.cache
@@ -220,7 +220,7 @@ def glass(color: Color = (0.62, 0.74, 0.72), seed: int = 5) -> Finish:
 def frosted(seed: int = 6) -> Finish:
     """Makes the finish of glass with an etched pattern: depth sensors do see it."""
     etched = ((0.9, 0.94, 0.94), (0.58, 0.69, 0.69))
-    texture = patterns.wallpaper((0.74, 0.82, 0.82), etched, "trellis", seed, 512)
+    texture = textures.wallpaper((0.74, 0.82, 0.82), etched, "trellis", seed, 512)
     return Finish(Material(texture, specular=0.4, shininess=60.0, mirror=0.08), (0.9, 0.9))
 
 

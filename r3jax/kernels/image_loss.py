@@ -1,4 +1,4 @@
-"""The loss of an image and its gradient in machine code: `training.loss`, row by row.
+"""The loss of an image and its gradient in machine code: `training.train_step`, row by row.
 
 With means m_x, m_y, variances and covariance under the Gaussian window, SSIM at a pixel is
 

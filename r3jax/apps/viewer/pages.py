@@ -1,15 +1,25 @@
-"""The page of a recorded run: its map over time, its model, and the scene that it was made in."""
+"""Two pages: of a recorded run, with its model and its scene; of an exploration that runs.
+
+The exploration never waits for the page, nor for a browser: it hands over references through a
+queue, another thread does the rest. Nothing flows back: the run is the one that it would be without
+a viewer.
+"""
 
 import contextlib
 import dataclasses
 import functools
 import math
+import queue
+import threading
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
+from types import TracebackType
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import trimesh
+import viser
 from PIL import Image
 from trimesh.exchange.gltf import export_glb
 from trimesh.visual import TextureVisuals
@@ -17,14 +27,18 @@ from trimesh.visual.material import PBRMaterial
 
 from r3jax.apps.viewer.app import App
 from r3jax.apps.viewer.blocks import scoring_of, title_of
-from r3jax.apps.viewer.color_maps import linear_light
-from r3jax.apps.viewer.overlays import recorded_points
+from r3jax.apps.viewer.pictures import linear_light, recorded_points
 from r3jax.apps.viewer.queries import Extras, Sources, picture_camera
 from r3jax.apps.viewer.server import close_server, open_server, url_of
-from r3jax.apps.viewer.story import Offer, RecordedStory, decide_again
+from r3jax.apps.viewer.story import LiveStory, Offer, RecordedStory, decide_again
 from r3jax.errors import InputError
+from r3jax.exploration.config import ExplorationConfig
+from r3jax.exploration.taken_views import TakenView
+from r3jax.geometry.cameras import Camera
+from r3jax.planning.planner import Planner
 from r3jax.runs.reader import Run
 from r3jax.runs.settings import scene_of_run, settings_of_run
+from r3jax.scoring.config import ScoringConfig
 from r3jax.simulators.base import Simulator
 from r3jax.simulators.raycast.raycast import RaycastSimulator
 from r3jax.simulators.scenes.registry import scene_hash
@@ -32,6 +46,10 @@ from r3jax.simulators.world import Material, World
 from r3jax.splatting.model import find_model, newest_name
 from r3jax.splatting.ply import read_scene
 from r3jax.splatting.scene import GaussianScene
+
+_Item = tuple[TakenView, Planner] | threading.Event | None
+"""A view and the planner that has seen it; an event to be set on the way; None: the end."""
+
 
 MAX_FACES = 500_000
 """Worlds with more triangles are not sent to a browser: 72 bytes each, and more for colors."""
@@ -228,7 +246,7 @@ class RecordedScene:
         Raises:
             ValueError: the scene cannot be opened, or is too large to be shown.
         """
-        from r3jax.apps.viewer.recorded import world_glb  # loads trimesh, which few pages need
+        from r3jax.apps.viewer.pages import world_glb  # loads trimesh, which few pages need
 
         if not isinstance(self._simulator, RaycastSimulator):
             raise InputError(self.remark or "the simulator of this scene has no mesh to show")
@@ -253,3 +271,83 @@ class RecordedScene:
             reason = " ".join(str(error).split())
         self.remark = f"no true image: the scene cannot be opened ({reason})"
         return None
+
+
+def open_live(
+    server: viser.ViserServer,
+    camera: Camera,
+    bounds: np.ndarray,
+    config: ExplorationConfig,
+    *,
+    title: str,
+    subtitle: str,
+    earlier: Run | None = None,
+) -> "LiveFeed":
+    """Opens a page for an exploration that is about to begin.
+
+    Args:
+        server: with an empty page; it stays the caller's.
+        camera: of every view.
+        bounds: of the scene, [2, 3] [m].
+        config: of the loop.
+        title: what it is.
+        subtitle: more about it.
+        earlier: what was recorded of the run, if it is gone on with.
+    """
+    story = LiveStory(camera, earlier)
+    max_range = jnp.asarray(config.max_range, dtype=jnp.float32)
+    scoring = ScoringConfig(max_range=max_range)
+    app = App(server, story, scoring, bounds, title=title, subtitle=subtitle)
+    return LiveFeed(server, app, story)
+
+
+class LiveFeed:
+    """Takes what a loop hands over, view by view. A context manager: leaving it ends the thread."""
+
+    def __init__(self, server: viser.ViserServer, app: App, story: LiveStory):
+        """Starts the thread that brings views to the page.
+
+        Args:
+            server: of the page; it stays the caller's.
+            app: of the page; closed when the feed is left.
+            story: the app's.
+        """
+        self.url = url_of(server)
+        """Where the page is."""
+        self.app, self._story = app, story
+        self._queue: queue.SimpleQueue[_Item] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="live", daemon=True)
+        self._thread.start()
+
+    def on_view(self, view: TakenView, planner: Planner) -> None:
+        """Puts a view that `explore` reports into the queue."""
+        self._queue.put((view, planner))
+
+    def settle(self, timeout: float) -> bool:
+        """Waits until every view so far is on the page; returns False after a timeout [s]."""
+        is_empty = threading.Event()
+        self._queue.put(is_empty)
+        return is_empty.wait(timeout) and self.app.worker.wait(timeout)
+
+    def _run(self) -> None:
+        while (view := self._queue.get()) is not None:
+            if isinstance(view, threading.Event):
+                view.set()
+                continue
+            self._story.add(*view)
+            self.app.grow()
+
+    def __enter__(self) -> "LiveFeed":
+        """Returns the feed itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Takes in what is in the queue, then ends all threads."""
+        self._queue.put(None)
+        self._thread.join()
+        self.app.close()

@@ -1,1 +1,0 @@
-"""The loss of an image and Adam's step."""

@@ -1,1 +1,0 @@
-"""Habitat-Sim as a simulator."""
