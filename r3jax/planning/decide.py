@@ -566,7 +566,7 @@ def explain_confinement(situation: Situation, config: PlannerConfig) -> tuple[st
         counts = travel.room.counts | extra
         assert isinstance(body, Body)
         advice = (
-            "the camera never shows the floor: tilt it down, or allow "
+            "the camera does not show the floor near the robot: tilt it down, or allow "
             "`Body(unknown_below=...)`, or raise the lowest part (`Body(heights=...)`)"
             if counts["unknown"] > counts["obstacle"]
             else "give a smaller footprint or margin, or move the robot to an open place"

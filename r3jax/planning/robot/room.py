@@ -40,9 +40,9 @@ _FLOOR_WITHIN = 3.0
 _FLOOR_SHARE = 0.25
 """The floor is the lowest level with this share of the voxels of the fullest one."""
 
-_MAX_BLIND = 2.0
-"""Unseen floor counts as free only up to this distance from the robot's path [m], even for cameras
-that see little of the floor."""
+_MAX_BLIND = 2.5
+"""A camera that first shows the floor farther off than this [m] does not show what stands before
+it, and has no blind spot that may be trusted."""
 
 _AHEAD = 0.5
 """How far before the robot everything must be known that its camera can see [m]."""
@@ -554,4 +554,5 @@ def _blind_radius(camera: Camera | None, T_world_camera: np.ndarray, height: flo
     ray = T[:3, :3] @ lowest
     if ray[2] >= -1e-2 * np.linalg.norm(ray):
         return 0.0
-    return min(max(height, 0.0) * float(np.hypot(ray[0], ray[1])) / -float(ray[2]), _MAX_BLIND)
+    radius = max(height, 0.0) * float(np.hypot(ray[0], ray[1])) / -float(ray[2])
+    return radius if radius <= _MAX_BLIND else 0.0
