@@ -465,8 +465,9 @@ def write_page(records: Sequence[Record], choosers: Sequence[str], folder: Path)
             if captures:
                 lines += [f"Means over {', '.join(captures)}:", markdown_table(table(at))]
             lines += ["PSNR by capture, of all choosers:", markdown_table(by_capture(some, share))]
-            lines.append("PSNR after the gain of each channel that fits best:")
-            lines.append(markdown_table(by_capture(some, share, "exposed")))
+            if any(r.get("exposed") for r in some if r["share"] == share):
+                lines.append("PSNR after the gain of each channel that fits best:")
+                lines.append(markdown_table(by_capture(some, share, "exposed")))
     commits = [r["commit"] for r in records]
     origin = joint_origin(f"experiments.{NAME}", [r["machine"] for r in records], commits)
     write_markdown(folder / "tables.md", lines, origin)
