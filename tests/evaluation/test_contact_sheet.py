@@ -73,10 +73,10 @@ def test_captions_and_scales_are_told():
     figure = contact_sheet([sheet_view(3), sheet_view(1)], "two\nlines")
     found = texts(figure)
     assert "two\nlines" in found
-    captions = [text for text in found if text.startswith("view")]
+    captions = [text for text in found if text.startswith("frame")]
     assert [caption.splitlines()[:2] for caption in captions] == [
-        ["view 3", "PSNR 13.0 dB"],
-        ["view 1", "PSNR 11.0 dB"],
+        ["frame 3", "PSNR 13.0 dB"],
+        ["frame 1", "PSNR 11.0 dB"],
     ]
     assert {"SSIM 0.800", "LPIPS 0.200", "R 0.50"} <= set(captions[0].splitlines())
     labels = [axes.get_xlabel() for axes in figure.axes]
