@@ -19,13 +19,16 @@ def pose_at(position: Sequence[float], yaw: float, pitch: float) -> np.ndarray:
 
 
 def depth_in_room(
-    camera: r3jax.Camera, pose: np.ndarray, boxes: Sequence[np.ndarray] = ()
+    camera: r3jax.Camera,
+    pose: np.ndarray,
+    boxes: Sequence[np.ndarray] = (),
+    room: np.ndarray = ROOM,
 ) -> np.ndarray:
     """z-depth [H, W] of the nearest box, or of the room's own walls."""
     rays = np.asarray(pixel_rays(camera), np.float64) @ pose[:3, :3].T
     position = pose[:3, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
-        depth = (np.where(rays > 0, ROOM[1], ROOM[0]) - position) / rays
+        depth = (np.where(rays > 0, room[1], room[0]) - position) / rays
         depth = depth.min(axis=2)
         for low, high in boxes:
             first = (np.where(rays > 0, low, high) - position) / rays
@@ -41,9 +44,10 @@ def frame_in_room(
     boxes: Sequence[np.ndarray] = (),
     noise: float = 0.0,
     seed: int = 0,
+    room: np.ndarray = ROOM,
 ) -> r3jax.Frame:
     """A gray frame, with depth off by a share of itself (standard deviation)."""
-    depth = depth_in_room(camera, pose, boxes)
+    depth = depth_in_room(camera, pose, boxes, room)
     depth *= 1.0 + noise * np.random.default_rng(seed).normal(size=depth.shape)
     rgb = np.full((camera.height, camera.width, 3), 0.5, np.float32)
     return r3jax.Frame(rgb, depth.astype(np.float32), pose, camera)

@@ -182,7 +182,8 @@ def empty_grid(bounds: np.ndarray | Array, cell_size: float = 0.2) -> OccupancyG
     if float(np.prod(cells)) > MAX_CELLS:
         raise InputError(
             f"bounds {box.tolist()} at {cell_size} m make {np.prod(cells):.3g} cells, more than "
-            f"{MAX_CELLS:.0e}: are the bounds in meters?"
+            f"{MAX_CELLS:.0e}: are the bounds in meters? A larger place is held in tiles: start "
+            "without bounds, or with MappingConfig(tiles=True)"
         )
     return OccupancyGrid(
         log_odds=jnp.zeros(tuple(int(c) for c in cells), dtype=jnp.float32),

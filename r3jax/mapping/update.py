@@ -38,7 +38,7 @@ from r3jax.mapping.state import MapState, a_map
 _NEAR = 1000.0
 """Up to this distance voxels of a millimeter have an index [m]."""
 
-_MAX_LOAD = 0.7
+MAX_LOAD = 0.7
 """The table grows before more than this share of its rows is in use."""
 
 
@@ -302,7 +302,7 @@ def update_growing(
     # Add first, grow afterwards: almost every frame fits, and checking costs as much as adding.
     after = update(state)
     # Also if something was dropped: a long probe sequence may fail below the limit.
-    while int(after.num_occupied) > _MAX_LOAD * after.capacity or int(after.dropped) > int(
+    while int(after.num_occupied) > MAX_LOAD * after.capacity or int(after.dropped) > int(
         state.dropped
     ):
         if most_rows is not None and state.capacity >= most_rows:

@@ -37,7 +37,8 @@ class GrowthAhead:
         state = planner.map_state
         capacity = state.capacity
         is_early = int(state.num_occupied) <= _FROM * capacity
-        if is_early or self._prepared > capacity or not planner.config.allow_growth:
+        is_fixed = planner.far is not None or not planner.config.allow_growth
+        if is_early or self._prepared > capacity or is_fixed:
             return
         self._prepared = 2 * capacity
         task = (planner, frame, 2 * capacity)

@@ -8,9 +8,10 @@
 immutable: each call returns a new one.
 """
 
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -39,8 +40,20 @@ from r3jax.mapping.occupancy import (
     squared_distance,
 )
 from r3jax.mapping.state import MapState, empty_map
+from r3jax.mapping.tiles import ACROSS, check_view, whole_map
 from r3jax.mapping.update import integrate_growing
-from r3jax.planning.decide import PlannerState
+from r3jax.planning.decide import GreedyPolicy, PlannerState
+from r3jax.planning.far import (
+    Far,
+    arrived,
+    check_policy,
+    columns_in,
+    first_far,
+    moved_to,
+    pixel_columns,
+    weigh_far,
+    with_views,
+)
 from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo, PlansAhead, Policy
 from r3jax.planning.pose_check import Reference, check_poses
 from r3jax.planning.registry import make_policy
@@ -72,6 +85,14 @@ class Planner(eqx.Module):
     reference: Reference | None = None
     """An early frame, kept until the poses of later frames agree with its depth."""
 
+    far: Far | None = eqx.field(static=True, default=None)
+    """All that is not at hand (`planning.far`); None: all is."""
+
+    @property
+    def whole_map(self) -> MapState:
+        """All voxels in one table: those at hand, and those in tiles."""
+        return self.map_state if self.far is None else whole_map(self.map_state, self.far.tiles)
+
 
 a_planner = one(Planner, "r3jax.start makes one")
 
@@ -79,7 +100,7 @@ a_planner = one(Planner, "r3jax.start makes one")
 @checked(camera=a_camera)
 def start(
     camera: Camera,
-    bounds: ArrayLike,
+    bounds: ArrayLike | None = None,
     policy: Policy | str = "r3-pano",
     *,
     starts: Iterable[ArrayLike] = (),
@@ -91,8 +112,10 @@ def start(
     The first one on a machine also starts a process that compiles the CPU kernels.
 
     Args:
-        camera: of the frames.
-        bounds: box of the space to explore: lower and upper corner, [2, 3] [m].
+        camera: of the frames; the widest of them.
+        bounds: box of the space to explore: lower and upper corner, [2, 3] [m]. None, or infinite
+            along some axes: a place of any size, of which what lies round the robot is at hand and
+            all else in tiles (`MappingConfig.tiles`); for r3 and r3-pano.
         policy: a policy, or its name (`r3jax policies` lists them).
         starts: initial poses [4, 4] of the cameras. The ball of `config.start_radius` around each
             counts as free, because no depth image shows it. Without a start the robot may be shut
@@ -109,9 +132,33 @@ def start(
     policy = make_policy(policy) if isinstance(policy, str) else policy
     # A fixed default, so that decisions are repeatable without a seed.
     key = jax.random.key(0) if key is None else key
-    grid = first_grid(np.asarray(bounds, dtype=np.float64), starts, config)
-    map_state = first_map(config)
-    return Planner(map_state, grid, policy.init(camera, grid, key=key), policy, config)
+    endless = [[-np.inf] * 3, [np.inf] * 3]
+    box = np.asarray(endless if bounds is None else bounds, dtype=np.float64)
+    if not config.tiles and np.all(np.isfinite(box)):
+        grid = first_grid(box, starts, config)
+        return Planner(first_map(config), grid, policy.init(camera, grid, key=key), policy, config)
+    starts = [np.asarray(pose) for pose in starts]
+    far = first_far(config, policy, camera, box, starts)
+    config = replace(config, tiles=True, capacity=far.tiles.capacity)
+    grid = mark_starts(far.grid(np.zeros(far.tiles.lattice.shape, np.float32)), starts, config)
+    policy_state = policy.init(camera, grid, key=key)
+    check_policy(policy, policy_state)
+    return Planner(first_map(config), grid, policy_state, policy, config, far=far)
+
+
+def at_hand(planner: Planner, position: np.ndarray) -> Planner:
+    """Moves what is at hand to a position [3] [m]; the same planner if it holds no tiles.
+
+    For those who look at a planner's map round a place; `observe` and `decide` do it by themselves.
+    """
+    if planner.far is None:
+        return planner
+    known = (planner.map_state, planner.grid, planner.policy_state, planner.far)
+    after = moved_to(known, cast(GreedyPolicy, planner.policy), np.asarray(position, np.float64))
+    if after is known:
+        return planner
+    map_state, grid, policy_state, far = after
+    return replace(planner, map_state=map_state, grid=grid, policy_state=policy_state, far=far)
 
 
 @checked(planner=a_planner, frame=a_frame)
@@ -131,7 +178,20 @@ def observe(planner: Planner, frame: Frame) -> Planner:
 
 def take_in(planner: Planner, frame: Frame) -> Planner:
     """Adds a frame as `observe` does, without checking its pose, for simulators."""
+    if planner.far is not None:
+        config = planner.config
+        check_view(planner.far.tiles, frame.camera, config.max_range, config.voxel_size)
+        planner = at_hand(planner, np.asarray(frame.T_world_camera)[:3, 3])
+    before = planner.map_state.capacity
     map_state, grid = add_frame(planner.map_state, planner.grid, frame, planner.config)
+    if planner.far is not None and map_state.capacity > before:
+        warnings.warn(
+            f"the table at hand grows from {before} to {map_state.capacity} rows, for which "
+            f"everything is compiled: {int(map_state.num_occupied)} voxels lie within "
+            f"{np.max(planner.far.tiles.lattice.edge) * ACROSS:.0f} m; larger voxels, a shorter "
+            "max_range or bounds that hold one floor make them fewer",
+            stacklevel=3,
+        )
     return tell_policy(replace(planner, map_state=map_state, grid=grid), frame)
 
 
@@ -156,10 +216,38 @@ def decide(
     # float64: the path begins at this very position.
     pose = np.asarray(T_world_camera, dtype=np.float64)
     check_near_origin("T_world_camera", pose[:3, 3])
+    planner = at_hand(planner, pose[:3, 3])
     decision, policy_state, info = planner.policy.decide(
         planner.policy_state, planner.map_state, planner.grid, pose, key=key
     )
-    return decision, replace(planner, policy_state=policy_state), info
+    after = replace(planner, policy_state=policy_state)
+    if planner.far is None:
+        return decision, after, info
+    return _decide_far(planner, after, pose, decision, info)
+
+
+def _decide_far(
+    before: Planner,
+    after: Planner,
+    pose: np.ndarray,
+    decision: Decision | None,
+    info: PlanInfo,
+) -> tuple[Decision | None, Planner, PlanInfo]:
+    """Weighs views that were left for later against a decision on what is at hand."""
+    assert before.far is not None
+    policy, here = cast(GreedyPolicy, before.policy), pose[:3, 3]
+    far = arrived(before.far, here)
+    best, left = weigh_far(far, policy, decision, pose)
+    if decision is not None:
+        left = with_views(left, decision, here, policy.config.radius)
+    if best is not decision and best is not None:
+        # The path to what was at hand is not taken: it leaves no trail.
+        state = replace(after.policy_state, trail=left.trail)
+        if info.outcome is not DecisionOutcome.MOVED:
+            info = PlanInfo(DecisionOutcome.MOVED, len(best.candidates), len(best.candidates),
+                            info.stage_seconds)  # fmt: skip
+        return best, replace(after, policy_state=state, far=left), info
+    return decision, replace(after, far=left.with_trail(after.policy_state.trail)), info
 
 
 @checked(planner=a_planner)
@@ -194,6 +282,7 @@ def observe_points(
     reach = planner.config.max_range if max_range is None else max_range
     if not 0.0 < reach < np.inf:
         raise InputError(f"max_range must be positive and finite [m], got {max_range}")
+    planner = at_hand(planner, np.median(begins.reshape(-1, 3), axis=0)) if ends.size else planner
     begins = np.broadcast_to(begins, ends.shape)
     is_valid = np.isfinite(ends).all(axis=1) & np.isfinite(begins).all(axis=1)
     grid = integrate_rays(planner.grid, ends[is_valid], begins[is_valid], reach)
@@ -215,12 +304,15 @@ def keep_out(planner: Planner, zones: Iterable[Any] | np.ndarray) -> Planner:
         ValueError: not a polygon, or a mask of another shape.
     """
     shape = planner.grid.log_odds.shape
+    polygons: list[np.ndarray] = []
+    columns = np.zeros(shape[:2], bool)
     if isinstance(zones, np.ndarray) and zones.dtype == bool:
+        if planner.far is not None:
+            raise InputError("a mask has no place in a world of tiles: give polygons")
         if zones.shape != shape[:2]:
             raise InputError(f"the mask must be [X, Y] = {list(shape[:2])}, got {zones.shape}")
         columns = zones
     else:
-        columns = np.zeros(shape[:2], bool)
         for zone in zones:
             corners = np.asarray(zone, np.float64)
             if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
@@ -229,6 +321,9 @@ def keep_out(planner: Planner, zones: Iterable[Any] | np.ndarray) -> Planner:
                     f"{corners.shape}"
                 )
             columns |= columns_in(planner.grid, corners)
+            polygons.append(corners)
+    if planner.far is not None:
+        planner = replace(planner, far=replace(planner.far, zones=tuple(polygons)))
     cells = np.broadcast_to(columns[:, :, None], shape)
     return replace(planner, grid=planner.grid.marked(cells, KEEP_OUT))
 
@@ -266,14 +361,10 @@ def with_costmap(
     if not 0.0 < resolution < np.inf:
         raise InputError(f"resolution must be positive [m], got {resolution}")
     y, x = np.nonzero(costs >= lethal)
-    # Both edges of a pixel: every cell that it overlaps is closed.
-    columns = np.zeros(planner.grid.log_odds.shape[:2], bool)
-    size, low = float(planner.grid.cell_size), np.asarray(planner.grid.origin, np.float64)[:2]
-    for dx, dy in ((0.01, 0.01), (0.01, 0.99), (0.99, 0.01), (0.99, 0.99)):
-        places = corner + resolution * np.stack([x + dx, y + dy], axis=1)
-        cells = np.floor((places - low) / size).astype(np.int64)
-        cells = cells[np.all((cells >= 0) & (cells < columns.shape), axis=1)]
-        columns[tuple(cells.T)] = True
+    corners = corner + resolution * np.stack([x, y], axis=1)
+    columns = pixel_columns(planner.grid, corners, resolution)
+    if planner.far is not None:
+        planner = replace(planner, far=replace(planner.far, costs=(corners, resolution)))
     cells = np.broadcast_to(columns[:, :, None], planner.grid.log_odds.shape)
     return replace(planner, grid=planner.grid.marked(cells, COSTMAP))
 
@@ -290,25 +381,14 @@ def refuse(planner: Planner, decision: Decision, radius: float = 0.5) -> Planner
         radius: radius around the goal [m].
     """
     goal = jnp.asarray(decision.T_world_camera[:3, 3], jnp.float32)
+    if planner.far is not None:
+        refused = np.append(decision.T_world_camera[:3, 3], radius)[None]
+        far = replace(planner.far, refused=np.concatenate([planner.far.refused, refused]))
+        planner = replace(planner, far=far)
     near = np.asarray(squared_distance(planner.grid, goal)) <= radius**2
     before = planner.grid.refused
     cells = near if before is None else near | before
     return replace(planner, grid=planner.grid.marked(cells, REFUSED))
-
-
-def columns_in(grid: OccupancyGrid, corners: np.ndarray) -> np.ndarray:
-    """Finds the columns of cells that a polygon [k, 2] [m] overlaps, [X, Y] bool."""
-    size, origin = float(grid.cell_size), np.asarray(grid.origin, np.float64)
-    num = 4  # zones thinner than a quarter of a cell may be missed
-    x, y = (
-        origin[i] + size / num * (np.arange(num * grid.log_odds.shape[i]) + 0.5) for i in range(2)
-    )
-    inside = np.zeros((len(x), len(y)), bool)
-    for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        if ay != by:  # the even-odd rule: each edge to the right of a point flips its state
-            crosses = (ay > y) != (by > y)
-            inside ^= crosses & (x[:, None] < ax + (y - ay) * (bx - ax) / (by - ay))
-    return np.asarray(inside.reshape(len(x) // num, num, len(y) // num, num).any(axis=(1, 3)))
 
 
 def decide_ahead(
@@ -329,6 +409,7 @@ def decide_ahead(
     """
     if not isinstance(planner.policy, PlansAhead):
         return None, planner, PlanInfo(DecisionOutcome.NO_CANDIDATE)
+    planner = at_hand(planner, T_next[:3, 3])
     pose = jnp.asarray(T_next, dtype=jnp.float32)
     map_state, grid = imagine_view(planner.map_state, planner.grid, camera, pose, scoring)
     decision, state, info = planner.policy.decide(
@@ -355,10 +436,11 @@ def reconsider(
     """
     policy = planner.policy
     assert isinstance(policy, PlansAhead)  # or `decide_ahead` had decided nothing
+    planner = at_hand(planner, T_world_camera[:3, 3])
     decision, state, info = policy.reconsider(
         planner.policy_state, planner.map_state, planner.grid, T_world_camera, planned, key=key
     )
-    return decision, replace(planner, policy_state=state), info
+    return decision, _with_trail(replace(planner, policy_state=state)), info
 
 
 def tell_policy(planner: Planner, frame: Frame) -> Planner:
@@ -375,10 +457,18 @@ def follow(planner: Planner, T_world_camera: np.ndarray, waypoints: np.ndarray) 
         T_world_camera: where the latest view was taken, [4, 4].
         waypoints: the path to the next one, [K, 3] [m].
     """
+    planner = at_hand(planner, T_world_camera[:3, 3])
     policy_state = planner.policy.follow(
         planner.policy_state, planner.map_state, planner.grid, T_world_camera, waypoints
     )
-    return replace(planner, policy_state=policy_state)
+    return _with_trail(replace(planner, policy_state=policy_state))
+
+
+def _with_trail(planner: Planner) -> Planner:
+    """Adds the path that the policy has noted to the trails."""
+    if planner.far is None:
+        return planner
+    return replace(planner, far=planner.far.with_trail(planner.policy_state.trail))
 
 
 def first_map(config: MappingConfig) -> MapState:

@@ -15,6 +15,7 @@ from jaxtyping import Array
 from r3jax.errors import InputError
 from r3jax.frame import Frame
 from r3jax.geometry.arguments import checked
+from r3jax.planning.far import NO_VIEWS
 from r3jax.planning.planner import Planner, a_planner, first_map, mark_starts, take_in
 
 _END: Any = object()
@@ -54,13 +55,19 @@ def rebuild(
     if first is None:
         raise InputError("rebuild needs at least one frame")
     starts = [np.asarray(first.T_world_camera)] if starts is None else starts
-    unknown = jnp.zeros_like(planner.grid.log_odds)
+    unknown, far = jnp.zeros_like(planner.grid.log_odds), planner.far
     grid = eqx.tree_at(lambda g: g.log_odds, planner.grid, unknown)
+    if far is not None:
+        # Trails and views were found on poses that were wrong.
+        tiles = replace(far.tiles, voxels={}, cells={})
+        far = replace(far, tiles=tiles, trails=far.trails[:0], views=NO_VIEWS)
     grid = mark_starts(grid, starts, planner.config)
     config = replace(planner.config, capacity=planner.map_state.capacity)
     key = jax.random.key(0) if key is None else key
     policy_state = planner.policy.init(first.camera, grid, key=key)
-    after = replace(planner, map_state=first_map(config), grid=grid, policy_state=policy_state)
+    after = replace(
+        planner, map_state=first_map(config), grid=grid, policy_state=policy_state, far=far
+    )
     after = take_in(after, first)
     for frame in frames:
         after = take_in(after, frame)

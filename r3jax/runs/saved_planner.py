@@ -23,6 +23,7 @@ from r3jax.geometry.cameras import Camera
 from r3jax.mapping.config import MappingConfig
 from r3jax.mapping.occupancy import OccupancyGrid, empty_grid
 from r3jax.mapping.state import empty_map
+from r3jax.planning.far import far_arrays, far_of
 from r3jax.planning.planner import Planner, a_planner
 from r3jax.planning.registry import config_class, make_policy
 from r3jax.planning.robot.motion import motion_of_record
@@ -59,6 +60,8 @@ def save(planner: Planner, path: str | Path) -> None:
     files.own_folder(folder, "planner")
     tables = map_tables(planner.map_state, planner.grid)
     tables["policy"] = named_arrays(planner.policy_state)
+    if planner.far is not None:
+        tables["far"] = far_arrays(planner.far)
     plain = {
         "format": FORMAT,
         "version": VERSION,
@@ -141,10 +144,12 @@ def _planner_of(
     )
     # Like a grid of one cell; the file lists its optional arrays.
     small = empty_grid(np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]), config.cell_size)
-    optional = {"worth_a_look": bool, "marks": np.uint8}
+    optional = {"explorable": bool, "marks": np.uint8}
     extra = {name: jnp.zeros(small.log_odds.shape, kind) for name, kind in optional.items()
              if name in tables["grid"]}  # fmt: skip
     like = OccupancyGrid(small.log_odds, small.origin, small.cell_size, **extra)
     grid = fill(like, tables["grid"])
     first = policy.init(camera, grid, key=jax.random.key(0))
-    return Planner(map_state, grid, fill(first, tables.get("policy", {})), policy, config)
+    policy_state = fill(first, tables.get("policy", {}))
+    far = far_of(tables["far"], config, camera) if config.tiles else None
+    return Planner(map_state, grid, policy_state, policy, config, far=far)

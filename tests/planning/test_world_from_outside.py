@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 import r3jax
 from r3jax.geometry.cameras import look_at
 from r3jax.mapping.occupancy import empty_grid, integrate_rays
-from r3jax.planning.planner import columns_in
+from r3jax.planning.far import columns_in
 from r3jax.planning.robot.motion import make_motion
 
 BOUNDS = np.array([[0.0, 0.0, 0.0], [4.0, 3.0, 2.0]])

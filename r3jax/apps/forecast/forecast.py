@@ -214,8 +214,10 @@ def is_done(planner: Planner, goal: str, camera: Camera | None = None) -> bool:
 
     Raises:
         ValueError: a goal that is not understood; or a policy that does not say which camera it
-            plans for.
+            plans for; or one of tiles, of which the forecast would read what is at hand only.
     """
+    if planner.far is not None:
+        raise InputError("a forecast reads a whole map, and this planner holds it in tiles")
     lens = getattr(planner.policy_state, "camera", None) if camera is None else camera
     if not isinstance(lens, Camera):
         raise InputError(f"the policy {planner.policy.name!r} keeps no camera: give camera=")

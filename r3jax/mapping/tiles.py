@@ -1,0 +1,545 @@
+"""Tiles: a map of any size, of which only what lies round the robot is at hand.
+
+The world is cut into boxes of some meters. A block of them is at hand: the rows of their voxels lie
+in one `MapState` whose capacity stays, their cells in arrays whose shape stays. Of all other tiles
+there are compact arrays on the host, by tile; planners share them, and none is ever written to.
+When the robot has left the tile in the middle of the block, `page` moves the block: tiles that it
+leaves behind go out of the table, those that it comes to join it, and what was removed is gone.
+
+Exact: the rows at hand and those of the tiles are the rows of the map without tiles, bit for bit,
+as long as no frame reaches beyond the block; `lattice_for` makes it large enough for a camera.
+
+Shape symbols: N capacity of the map; n voxels; X Y Z cells at hand.
+"""
+
+import itertools
+import math
+import zlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from r3jax.errors import InputError
+from r3jax.geometry.cameras import Camera
+from r3jax.geometry.voxels import EMPTY_WORD, INDEX_LIMIT, check_near_origin
+from r3jax.kernels.constants import MAX_PROBES
+from r3jax.mapping.config import MappingConfig
+from r3jax.mapping.state import MapState
+from r3jax.mapping.table import hash_on_host
+from r3jax.mapping.update import MAX_LOAD
+
+Tile = tuple[int, int, int]
+"""Number of a tile along each axis."""
+
+ACROSS = 5
+"""Tiles at hand along an axis: the robot's own, and two on each side."""
+
+HYSTERESIS = 0.5
+"""The block stays until the robot is so far out of its middle tile [m]: on a border it would move
+to and fro."""
+
+VOXELS_PER_AREA = 2.5
+"""Voxels over one square of the floor as large as a voxel's face: floor, ceiling and walls of rooms
+of 6 m have 2.1."""
+
+_MASK21 = np.uint64((1 << 21) - 1)
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """How the world is cut."""
+
+    origin: tuple[float, float, float]
+    """Lower corner of tile (0, 0, 0) [m]."""
+
+    cells: Tile
+    """Cells of a tile along each axis."""
+
+    cell_size: float
+    """Edge of a cell [m]."""
+
+    num: Tile
+    """Tiles at hand along each axis: `ACROSS`, or 1 along an axis that is not cut."""
+
+    reach: float
+    """A voxel farther from the camera than this is not touched [m]."""
+
+    @property
+    def edge(self) -> np.ndarray:
+        """Edges of a tile [m], [3]."""
+        return np.array(self.cells) * self.cell_size
+
+    @property
+    def shape(self) -> Tile:
+        """Cells at hand along each axis."""
+        x, y, z = (n * c for n, c in zip(self.num, self.cells, strict=True))
+        return x, y, z
+
+    def corner(self, middle: Tile) -> np.ndarray:
+        """Computes the lower corner of the block round a tile [m], [3]."""
+        first = np.array(middle) - np.array(self.num) // 2
+        return np.array(self.origin) + first * self.edge
+
+    def tiles_of(self, points: np.ndarray) -> np.ndarray:
+        """Finds the tile of each point, [3, n] int64, from coordinates [3, n] [m]."""
+        tile = np.floor((points - np.array(self.origin)[:, None]) / self.edge[:, None])
+        # Along an axis that is not cut there is one tile, wherever it may end.
+        return np.where(np.array(self.num)[:, None] == 1, 0, tile).astype(np.int64)
+
+    def block(self, middle: Tile) -> Iterable[Tile]:
+        """Lists the tiles of the block round a tile."""
+        x, y, z = (range(m - n // 2, m + n // 2 + 1) for m, n in zip(middle, self.num, strict=True))
+        return itertools.product(x, y, z)
+
+
+def lattice_for(config: MappingConfig, camera: Camera, box: np.ndarray) -> Lattice:
+    """Cuts the world so that no frame of a camera reaches beyond the tiles at hand.
+
+    Args:
+        config: voxels, cells, range.
+        camera: the widest of all cameras whose frames come in.
+        box: of the space to explore, [2, 3] [m]; may be infinite. An axis along which it fits into
+            the block is not cut.
+    """
+    # A range is a depth for points of pixels: in the corner of an image they are farther away.
+    reach = config.max_range * longest_ray(camera) + 2.0 * config.voxel_size
+    half = (reach + HYSTERESIS) / (ACROSS // 2)
+    # Where views are chosen along the level, all that is seen from one place shall be at hand.
+    edges = np.array([max(half, config.max_range), max(half, config.max_range), half])
+    cells = np.ceil(edges / config.cell_size - 1e-6).astype(int)
+    length = np.ceil((box[1] - box[0]) / config.cell_size - 1e-6) + 2.0
+    is_whole = length <= ACROSS * cells
+    origin = np.where(is_whole, box[0] - config.cell_size, 0.0)
+    cells = np.where(is_whole, np.minimum(length, 1e6), cells).astype(int)
+    num = np.where(is_whole, 1, ACROSS)
+    triple: Any = lambda values, kind: tuple(kind(v) for v in values)
+    return Lattice(triple(origin, float), triple(cells, int), config.cell_size,
+                   triple(num, int), reach)  # fmt: skip
+
+
+def longest_ray(camera: Camera) -> float:
+    """Computes how much farther than its depth the farthest point of an image is away."""
+    x = max(float(camera.cx), camera.width - float(camera.cx)) / float(camera.fx)
+    y = max(float(camera.cy), camera.height - float(camera.cy)) / float(camera.fy)
+    return math.sqrt(1.0 + x * x + y * y)
+
+
+def capacity_for(lattice: Lattice, voxel_size: float) -> int:
+    """Chooses the rows of the table at hand: `VOXELS_PER_AREA` times the block's floor, at 70 %."""
+    x, y, _ = lattice.edge * np.array(lattice.num)
+    rows = VOXELS_PER_AREA * x * y / voxel_size**2 / MAX_LOAD
+    return 1 << max(12, math.ceil(math.log2(rows)))
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """The voxels of one tile, sorted by place.
+
+    With 64 bins and fewer than 256 observations 33 bytes each, 34 where one of them was looked
+    through: 4 for the place, 8 for the bins, 1 for the count, 20 for five floats that stay as they
+    are. In the table a row takes 41, and there is room for more of them.
+    """
+
+    box: np.ndarray
+    """Lowest index of a voxel along each axis, and how many there are, [2, 3]."""
+
+    place: np.ndarray
+    """Number of the voxel in that box, [n]."""
+
+    visited: np.ndarray
+    """[W, n] uint32."""
+
+    count: np.ndarray
+    """[n]; of the shortest kind of integer that holds them all."""
+
+    mean: np.ndarray
+    """[3, n] float32."""
+
+    m2: np.ndarray
+    """[n] float32."""
+
+    resolution: np.ndarray
+    """[n] float32."""
+
+    misses: np.ndarray | None
+    """[n] uint8; None: all 0."""
+
+    @property
+    def nbytes(self) -> int:
+        """Memory [bytes]."""
+        return sum(x.nbytes for x in vars(self).values() if x is not None)
+
+
+class Layer(NamedTuple):
+    """Cells of a tile, compressed."""
+
+    data: bytes
+    kind: str
+
+
+@dataclass(frozen=True, eq=False)
+class Tiles:
+    """All that is not at hand, and where the block at hand lies."""
+
+    lattice: Lattice
+
+    middle: Tile
+    """The tile in the middle of the block."""
+
+    capacity: int
+    """Rows of the table at hand; more only for as long as what is at hand needs them."""
+
+    voxels: Mapping[Tile, Rows] = field(default_factory=dict[Tile, Rows])
+    """Tiles out of the block that hold voxels."""
+
+    cells: Mapping[Tile, Mapping[str, Layer]] = field(default_factory=dict[Tile, dict[str, Layer]])
+    """Tiles out of the block of whose cells anything is known."""
+
+    @property
+    def num_voxels(self) -> int:
+        """Number of voxels in all tiles."""
+        return sum(len(rows.place) for rows in self.voxels.values())
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of all tiles [bytes]."""
+        layers = (len(x.data) for cells in self.cells.values() for x in cells.values())
+        return sum(rows.nbytes for rows in self.voxels.values()) + sum(layers)
+
+
+Layers = Mapping[str, np.ndarray]
+"""Named numbers of the cells at hand, [X, Y, Z] each; 0: nothing is known."""
+
+
+def middle_for(tiles: Tiles, position: np.ndarray) -> Tile:
+    """Finds the middle tile of the block for a robot's position [3] [m]: most often the same."""
+    lattice, middle = tiles.lattice, np.array(tiles.middle)
+    own = lattice.tiles_of(np.asarray(position, np.float64)[:, None])[:, 0]
+    low = np.array(lattice.origin) + middle * lattice.edge
+    gap = np.maximum(low - position, position - (low + lattice.edge))
+    x, y, z = (int(i) for i in np.where(gap > HYSTERESIS, own, middle))
+    return x, y, z
+
+
+def page(
+    state: MapState, layers: Layers, tiles: Tiles, position: np.ndarray
+) -> tuple[MapState, Layers, Tiles]:
+    """Moves the block at hand to a position, if it has left the middle of the block.
+
+    Args:
+        state: the rows at hand.
+        layers: the cells at hand.
+        tiles: all others.
+        position: of the robot, or of the camera whose frame comes next, [3] [m].
+
+    Returns:
+        The same three, unchanged while the robot stays; else in a table without rows of voxels that
+        were removed.
+
+    Raises:
+        ValueError: a position so far from the origin that float32 cannot tell voxels apart.
+    """
+    check_near_origin("position", position)
+    middle = middle_for(tiles, position)
+    if middle == tiles.middle:
+        return state, layers, tiles
+    cells, layers = _shift(layers, tiles, middle)
+    state, voxels = _exchange(state, tiles, middle)
+    return state, layers, replace(tiles, middle=middle, cells=cells, voxels=voxels)
+
+
+def _shift(
+    layers: Layers, tiles: Tiles, middle: Tile
+) -> tuple[Mapping[Tile, Mapping[str, Layer]], Layers]:
+    """Moves the cells at hand: returns the cells of all other tiles, and the arrays."""
+    lattice = tiles.lattice
+    before, after = set(lattice.block(tiles.middle)), set(lattice.block(middle))
+    far = dict(tiles.cells)
+    moved = {name: np.zeros_like(x) for name, x in layers.items()}
+    for tile in before - after:
+        at = _slices(lattice, tiles.middle, tile)
+        found = {name: packed_layer(x[at]) for name, x in layers.items() if x[at].any()}
+        if found:
+            far[tile] = found
+    for tile in after:
+        to = _slices(lattice, middle, tile)
+        if tile in before:
+            at = _slices(lattice, tiles.middle, tile)
+            for name, x in layers.items():
+                moved[name][to] = x[at]
+        else:
+            for name, layer in far.pop(tile, {}).items():
+                moved[name][to] = unpacked_layer(layer, lattice.cells)
+    return far, moved
+
+
+def _slices(lattice: Lattice, middle: Tile, tile: Tile) -> tuple[slice, ...]:
+    """Finds a tile's part of the arrays of a block."""
+    first = [t - m + n // 2 for t, m, n in zip(tile, middle, lattice.num, strict=True)]
+    return tuple(slice(i * c, (i + 1) * c) for i, c in zip(first, lattice.cells, strict=True))
+
+
+def packed_layer(x: np.ndarray) -> Layer:
+    """Compresses the cells of a tile."""
+    # Most cells are never touched, or free as can be: a fifth is left of them, at no time.
+    return Layer(zlib.compress(np.ascontiguousarray(x).tobytes(), 1), x.dtype.str)
+
+
+def unpacked_layer(layer: Layer, shape: Tile) -> np.ndarray:
+    """Undoes `packed_layer`."""
+    return np.frombuffer(zlib.decompress(layer.data), layer.kind).reshape(shape)
+
+
+_Arrays = dict[str, np.ndarray]
+"""Fields of a map by name, the long axis last; in place of the key `whole` [n]: both of its words
+as one number."""
+
+
+def packed_index(index: np.ndarray) -> np.ndarray:
+    """Packs voxel indices [3, n] as `geometry.voxels.pack` does, [n] uint64."""
+    x, y, z = (index + INDEX_LIMIT).astype(np.uint64)
+    return x | (y << np.uint64(21)) | (z << np.uint64(42))
+
+
+def _along(whole: np.ndarray, axis: int) -> np.ndarray:
+    """Unpacks the voxel indices along one axis, [n] int32."""
+    index = (whole >> np.uint64(21 * axis)) & _MASK21
+    return index.astype(np.int32) - np.int32(INDEX_LIMIT)
+
+
+def _index(whole: np.ndarray) -> np.ndarray:
+    """Unpacks the voxel indices, [3, n] int64."""
+    return np.stack([_along(whole, axis) for axis in range(3)]).astype(np.int64)
+
+
+def _exchange(state: MapState, tiles: Tiles, middle: Tile) -> tuple[MapState, Mapping[Tile, Rows]]:
+    """Moves rows between the table and the tiles: returns the table, and the other tiles."""
+    lattice, size = tiles.lattice, float(state.voxel_size)
+    present = np.flatnonzero(np.asarray(state.present))
+    key = np.asarray(state.key)[:, present].astype(np.uint64)
+    whole = key[0] | (key[1] << np.uint64(32))
+    stays = np.ones(len(whole), bool)
+    for axis, (first, last) in enumerate(_indices_of(lattice, middle, size)):
+        index = _along(whole, axis)
+        stays &= (index >= first) & (index < last)
+    far = dict(tiles.voxels)
+    coming = [far.pop(t) for t in lattice.block(middle) if t in far]
+    if not coming and stays.all():
+        return state, far
+    leaving = _rows_of(state, present[~stays], whole[~stays])
+    for tile, rows in tile_rows(leaving, lattice, size):
+        assert tile not in far, "a frame reached beyond the block"
+        far[tile] = rows
+    kept = _rows_of(state, present[stays], whole[stays])
+    return _joined([kept], coming, state, tiles.capacity), far
+
+
+def _indices_of(lattice: Lattice, middle: Tile, size: float) -> Iterable[tuple[int, int]]:
+    """Finds the first index of a voxel in a block, and the first beyond it, along each axis."""
+    corner = lattice.corner(middle)
+    for axis in range(3):
+        if lattice.num[axis] == 1:
+            yield -INDEX_LIMIT, INDEX_LIMIT
+            continue
+        ends: list[int] = []
+        for side in (0, lattice.num[axis]):
+            # By the rule for tiles itself: rounding must not put a voxel into neither of two.
+            near = int((corner[axis] + side * lattice.edge[axis]) / size)
+            index = np.arange(near - 3, near + 4)
+            tile = lattice.tiles_of(np.tile((index + 0.5) * size, (3, 1)))[axis]
+            wanted = middle[axis] - lattice.num[axis] // 2 + side
+            ends.append(int(index[np.searchsorted(tile, wanted)]))
+        yield ends[0], ends[1]
+
+
+def _joined(parts: list[_Arrays], tiles: Iterable[Rows], like: MapState, capacity: int) -> MapState:
+    """Builds a table of arrays of rows and of tiles."""
+    more = [_expanded(rows, counts_misses=like.misses is not None) for rows in tiles]
+    names = parts[0]
+    rows = {name: np.concatenate([p[name] for p in [*parts, *more]], axis=-1) for name in names}
+    return table_of(rows, like, capacity)
+
+
+def _rows_of(state: MapState, rows: np.ndarray, whole: np.ndarray) -> _Arrays:
+    """Copies some rows to the host, whose keys are known."""
+    names = ("visited", "count", "mean", "m2", "resolution", "misses")
+    found = {name: getattr(state, name) for name in names}
+    return {"whole": whole} | {
+        name: np.take(np.asarray(x), rows, axis=-1) for name, x in found.items() if x is not None
+    }
+
+
+def tile_rows(rows: _Arrays, lattice: Lattice, size: float) -> Iterable[tuple[Tile, Rows]]:
+    """Sorts rows of voxels of some size by tile, and makes them compact."""
+    tile = lattice.tiles_of((_index(rows["whole"]) + 0.5) * size)
+    order = np.lexsort((rows["whole"], packed_index(tile)))
+    tile = tile[:, order]
+    cuts = np.flatnonzero(np.any(np.diff(tile, axis=1) != 0, axis=0)) + 1
+    for part in np.split(np.arange(len(order)), cuts):
+        if len(part):
+            x, y, z = (int(i) for i in tile[:, part[0]])
+            yield (x, y, z), _compact({name: a[..., order[part]] for name, a in rows.items()})
+
+
+def _compact(rows: _Arrays) -> Rows:
+    """Stores rows of one tile, in the order of their places, in as few bytes as hold them."""
+    index = _index(rows["whole"])
+    low = index.min(axis=1)
+    span = index.max(axis=1) - low + 1
+    place = ((index[0] - low[0]) * span[1] + index[1] - low[1]) * span[2] + index[2] - low[2]
+    fields = {name: x for name, x in rows.items() if name != "whole"}
+    return _shortest(np.stack([low, span]), place, fields)
+
+
+def _shortest(box: np.ndarray, place: np.ndarray, fields: _Arrays) -> Rows:
+    """Makes rows of the shortest kinds of numbers that hold them."""
+    count, misses = fields["count"], fields.get("misses")
+    whole = count.astype(np.min_scalar_type(int(count.max())))
+    return Rows(
+        box=box,
+        place=place.astype(np.min_scalar_type(max(int(place.max()), 1 << 16))),
+        visited=fields["visited"],
+        # Observations are counted in whole numbers, but for maps that others have weighted.
+        count=whole if np.array_equal(whole, count) else count,
+        mean=fields["mean"],
+        m2=fields["m2"],
+        resolution=fields["resolution"],
+        misses=misses if misses is not None and misses.any() else None,
+    )
+
+
+def _expanded(rows: Rows, *, counts_misses: bool) -> _Arrays:
+    """Undoes `_compact`."""
+    (low, span), place = rows.box, rows.place.astype(np.int64)
+    offset = np.stack([place // (span[1] * span[2]), place // span[2] % span[1], place % span[2]])
+    arrays = {name: getattr(rows, name) for name in ("visited", "mean", "m2", "resolution")}
+    if counts_misses:
+        none = np.zeros(len(place), np.uint8)
+        arrays["misses"] = none if rows.misses is None else rows.misses
+    return arrays | {
+        "count": rows.count.astype(np.float32),
+        "whole": packed_index(offset + low[:, None]),
+    }
+
+
+def table_of(rows: _Arrays, like: MapState, capacity: int) -> MapState:
+    """Builds a table of rows: of `capacity`, or larger if they need it."""
+    while len(rows["whole"]) > MAX_LOAD * capacity:
+        capacity *= 2
+    words = rows["whole"] & np.uint64(0xFFFFFFFF), rows["whole"] >> np.uint64(32)
+    key = np.stack(words).astype(np.uint32)
+    row = _places(key, capacity)
+    table = np.full((2, capacity), EMPTY_WORD, np.uint32)
+    table[:, row] = key
+    arrays: dict[str, Any] = {"key": jnp.asarray(table)}
+    for name, x in rows.items():
+        if name != "whole":
+            field = np.zeros((*x.shape[:-1], capacity), x.dtype)
+            field[..., row] = x
+            arrays[name] = jnp.asarray(field)
+    return replace(like, **arrays)
+
+
+def _places(key: np.ndarray, capacity: int) -> np.ndarray:
+    """Finds a row of an empty table for each of distinct keys [2, n].
+
+    Along the probes of `mapping.table`: all keys bid for a row, the last bidder gets it, and the
+    others go on to their next one.
+    """
+    hashed, row = hash_on_host(key), np.full(key.shape[1], capacity)
+    owner, wanting = np.full(capacity, -1, np.int32), np.arange(key.shape[1], dtype=np.int32)
+    for probe in range(MAX_PROBES):
+        if not len(wanting):
+            return row
+        step = np.uint32(probe * (probe + 1) // 2)
+        slot = ((hashed[wanting] + step) & np.uint32(capacity - 1)).astype(np.int64)
+        is_open = owner[slot] < 0
+        bidding, slots = wanting[is_open], slot[is_open]
+        owner[slots] = bidding
+        is_won = owner[slots] == bidding
+        row[bidding[is_won]] = slots[is_won]
+        wanting = wanting[row[wanting] == capacity]
+    raise RuntimeError(f"{len(wanting)} of {key.shape[1]} voxels found no row of {capacity}")
+
+
+def check_view(tiles: Tiles, camera: Camera, max_range: float, voxel_size: float) -> None:
+    """Refuses a camera whose frames would reach beyond the tiles at hand.
+
+    Raises:
+        ValueError: its field of view is wider than that of the camera at the start.
+    """
+    reach = max_range * longest_ray(camera) + 2.0 * voxel_size
+    if reach > tiles.lattice.reach * (1.0 + 1e-6):
+        raise InputError(
+            f"the frame's camera sees {reach:.1f} m far into its corners, the one that the planner "
+            f"was started for {tiles.lattice.reach:.1f} m: start it with the widest camera"
+        )
+
+
+def whole_map(state: MapState, tiles: Tiles) -> MapState:
+    """Joins the rows at hand and those of all tiles in one table, as large as it must be."""
+    present = np.flatnonzero(np.asarray(state.present))
+    key = np.asarray(state.key)[:, present].astype(np.uint64)
+    kept = _rows_of(state, present, key[0] | (key[1] << np.uint64(32)))
+    return _joined([kept], tiles.voxels.values(), state, state.capacity)
+
+
+def arrays_of(tiles: Tiles) -> dict[str, np.ndarray]:
+    """Lists all that tiles hold as some arrays, to be stored: the inverse of `with_arrays`."""
+    arrays = {"middle": np.array(tiles.middle), "capacity": np.array(tiles.capacity)}
+    voxels = list(tiles.voxels.items())
+    if voxels:
+        every = [rows for _, rows in voxels]
+        arrays["voxels.tile"] = np.array([tile for tile, _ in voxels])
+        arrays["voxels.num"] = np.array([len(rows.place) for rows in every])
+        arrays["voxels.box"] = np.stack([rows.box for rows in every])
+        arrays["voxels.place"] = np.concatenate([rows.place for rows in every])
+        expanded = [_expanded(rows, counts_misses=True) for rows in every]
+        for name in expanded[0].keys() - {"whole"}:
+            arrays[f"voxels.{name}"] = np.concatenate([x[name] for x in expanded], axis=-1)
+    for name in sorted({name for layers in tiles.cells.values() for name in layers}):
+        found = [(tile, layers[name]) for tile, layers in tiles.cells.items() if name in layers]
+        arrays[f"cells.{name}.tile"] = np.array([tile for tile, _ in found])
+        arrays[f"cells.{name}.num"] = np.array([len(layer.data) for _, layer in found])
+        data = b"".join(layer.data for _, layer in found)
+        arrays[f"cells.{name}.data"] = np.frombuffer(data, np.uint8)
+    return arrays
+
+
+def with_arrays(tiles: Tiles, arrays: Mapping[str, np.ndarray], kinds: Mapping[str, str]) -> Tiles:
+    """Fills tiles with stored arrays.
+
+    Args:
+        tiles: of the same lattice.
+        arrays: of `arrays_of`.
+        kinds: type of the numbers of each layer.
+
+    Raises:
+        KeyError: an array is missing.
+        ValueError: arrays that do not fit together.
+    """
+    voxels, cells = dict[Tile, Rows](), dict[Tile, dict[str, Layer]]()
+    if "voxels.tile" in arrays:
+        names = ("visited", "count", "mean", "m2", "resolution", "misses")
+        for i, tile, part in _parts(arrays["voxels.tile"], arrays["voxels.num"]):
+            fields = {name: arrays[f"voxels.{name}"][..., part] for name in names}
+            voxels[tile] = _shortest(arrays["voxels.box"][i], arrays["voxels.place"][part], fields)
+    for name, kind in kinds.items():
+        if f"cells.{name}.tile" in arrays:
+            data = arrays[f"cells.{name}.data"]
+            tiles_of_layer = arrays[f"cells.{name}.tile"], arrays[f"cells.{name}.num"]
+            for _, tile, part in _parts(*tiles_of_layer):
+                cells.setdefault(tile, {})[name] = Layer(data[part].tobytes(), kind)
+    x, y, z = (int(i) for i in arrays["middle"])
+    capacity = int(arrays["capacity"])
+    return replace(tiles, middle=(x, y, z), capacity=capacity, voxels=voxels, cells=cells)
+
+
+def _parts(tile: np.ndarray, num: np.ndarray) -> Iterable[tuple[int, Tile, slice]]:
+    """Lists each tile's number, name and part of arrays in which all follow one another."""
+    ends = np.cumsum(num)
+    for i, (x, y, z) in enumerate(tile):
+        yield i, (int(x), int(y), int(z)), slice(int(ends[i] - num[i]), int(ends[i]))
