@@ -31,10 +31,10 @@ from r3jax.kernels.native.platform import by_platform
 from r3jax.mapping.join import combine_moments
 from r3jax.mapping.occupancy import (
     LOG_ODDS_LIMIT,
+    VOUCHED_LOG_ODDS,
     OccupancyGrid,
     empty_grid,
     integrate_depth,
-    mark_free_ball,
 )
 from r3jax.mapping.seen import hidden_by_none, mark_seen
 from r3jax.mapping.state import MapState, empty_map
@@ -197,15 +197,22 @@ def _measured_points(frame: Frame) -> np.ndarray:
 
 
 def free_round(grid: OccupancyGrid, cameras: np.ndarray) -> OccupancyGrid:
-    """Marks the space round the cameras [n, 3] as free, a margin wide [audit units]."""
-    for position in cameras:
-        grid = _free_ball(grid, jnp.asarray(position, dtype=jnp.float32))
-    return grid
+    """Marks the space round the cameras [n, 3] as free, a margin wide [audit units].
 
-
-@jax.jit
-def _free_ball(grid: OccupancyGrid, center: Float[Array, " 3"]) -> OccupancyGrid:
-    return mark_free_ball(grid, center, MARGIN)
+    As `mark_free_ball` round each, in time of the cells near the cameras: a page that is live does
+    it with every frame.
+    """
+    origin, cell = np.asarray(grid.origin, np.float64), float(grid.cell_size)
+    reach = np.arange(-int(np.ceil(MARGIN / cell)), int(np.ceil(MARGIN / cell)) + 1)
+    around = np.stack(np.meshgrid(reach, reach, reach, indexing="ij"), axis=-1).reshape(-1, 3)
+    cells = np.floor((cameras - origin) / cell).astype(np.int64)[:, None] + around
+    gap = np.linalg.norm(origin + (cells + 0.5) * cell - cameras[:, None], axis=-1)
+    is_near = (gap <= MARGIN) & np.all((cells >= 0) & (cells < grid.log_odds.shape), axis=-1)
+    log_odds, free = np.array(grid.log_odds), np.zeros(grid.log_odds.shape, dtype=bool)
+    free[tuple(cells[is_near].T)] = True
+    free &= ~np.asarray(grid.occupied)
+    log_odds[free] = np.minimum(log_odds[free], np.float32(VOUCHED_LOG_ODDS))
+    return eqx.tree_at(lambda g: g.log_odds, grid, jnp.asarray(log_odds))
 
 
 def grown(state: MapState, frame: Frame, drop_edges: bool, max_range: float = RANGE) -> MapState:

@@ -4,7 +4,9 @@ import functools
 import tempfile
 from pathlib import Path
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
@@ -17,7 +19,7 @@ from r3jax.captures.source import Source, source_of
 from r3jax.captures.survey import RANGE, Survey, survey_of
 from r3jax.formats.colmap.reader import read_colmap
 from r3jax.formats.recordings import read_recording
-from r3jax.mapping.occupancy import centers_on_host, empty_grid
+from r3jax.mapping.occupancy import centers_on_host, empty_grid, mark_free_ball
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.mapping.update import integrate
 from tests.apps.audit.room import round_poses, write_colmap, write_recording
@@ -123,6 +125,19 @@ def test_the_camera_stands_in_free_space():
     grid = seen().grid
     cells = np.floor((source.poses[:, :3, 3] - np.asarray(grid.origin)) / float(grid.cell_size))
     assert np.asarray(grid.free)[tuple(cells.astype(int).T)].all()
+
+
+@given(st.integers(0, 100))
+def test_cameras_free_the_space_round_them_as_one_after_the_other(seed):
+    rng = np.random.default_rng(seed)
+    grid = empty_grid(np.array([[0.0, 0.0, 0.0], [2.0, 1.4, 1.0]]), 0.2)
+    odds = rng.uniform(-4.0, 4.0, grid.log_odds.shape).astype(np.float32)
+    grid = one_by_one = eqx.tree_at(lambda g: g.log_odds, grid, jnp.asarray(odds))
+    cameras = rng.uniform(-0.3, 2.2, (6, 3))
+    for camera in cameras:
+        one_by_one = mark_free_ball(one_by_one, jnp.asarray(camera, jnp.float32), real.MARGIN)
+    found = real.free_round(grid, cameras)
+    np.testing.assert_array_equal(found.log_odds, one_by_one.log_odds)
 
 
 def test_voxels_that_are_far_too_small_are_refused(monkeypatch):
