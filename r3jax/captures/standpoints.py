@@ -59,6 +59,13 @@ class Places:
     """False if the floor is not known: then nothing is said of standing."""
 
     @property
+    def seen_from(self) -> str:
+        """What is evaluated from here, for the reader."""
+        if self.is_checked:
+            return "the surface visible from where a person could stand"
+        return "the surface visible from around the cameras"
+
+    @property
     def standing(self) -> np.ndarray:
         """Places over one's feet, [q, 3]; all of them where the floor is not known."""
         return self.eyes[: self.num_standing]

@@ -12,8 +12,9 @@ from matplotlib.patches import Circle
 from r3jax.apps.audit.audit import Audit, EvaluatedFrame
 from r3jax.apps.audit.bad_regions import BLOCK, Region
 from r3jax.apps.audit.diagnosis import known_rows
-from r3jax.apps.audit.directions import Way, likest_picture
+from r3jax.apps.audit.directions import Way
 from r3jax.apps.audit.ground_plan import COLOR_OF_CAUSE
+from r3jax.apps.audit.promise import LOSS, LOSS_RANDOM, expected
 from r3jax.apps.audit.sentences import region_letter
 from r3jax.apps.audit.suggest import Suggestion
 from r3jax.captures.source import projected
@@ -28,9 +29,6 @@ _FINE_BUFFER = 320
 
 _SIDE = 2.4
 """Width of a picture beside a view [inch]."""
-
-_SHOWS = 0.3
-"""An image that shows less of a view than this share does not help to find it."""
 
 _FILLED = 0.4
 """A view of which the map shows less than this share of the pixels looks like nothing."""
@@ -74,24 +72,25 @@ def frames_figure(audit: Audit) -> Figure:
 
 
 def gain_figure(audit: Audit) -> Figure:
-    """Draws the mean renderability of all surfaces after suggested views, and after random ones."""
+    """Draws the share seen well enough after suggested pictures, and after random ones."""
     figure = style.new_figure(10.0, 2.7)
     axes = style.dress(
-        figure.subplots(), "What the views promise", "views taken", "mean R of the surfaces"
+        figure.subplots(), "What the pictures promise", "pictures taken", "seen well enough [%]"
     )
-    start = audit.diagnosis.mean
-    chosen = [start, *(view.mean_after for view in audit.plan.ranked)]
-    drawn = [start, *audit.plan.random_mean]
-    axes.plot(
-        chosen,
-        color=style.ACCENT,
-        linewidth=2.0,
-        marker="o",
-        label="suggested, the most useful first",
-    )
-    axes.plot(drawn, color="#9ca3af", linewidth=1.5, marker="o", markersize=3,
-              label="at random places and directions")  # fmt: skip
-    axes.set_xticks(range(len(chosen)))
+    before = audit.diagnosis.fine_share
+    taken = np.arange(len(audit.plan.views) + 1)
+    for shares, loss, color, label in (
+        ([view.fine_after for view in audit.plan.ranked], LOSS, style.ACCENT,
+         "suggested, the most useful first"),
+        (audit.plan.random_fine, LOSS_RANDOM, "#9ca3af", "at random places and directions"),
+    ):  # fmt: skip
+        simulated = enumerate([before, *shares])
+        line = 100 * np.array([expected(share, count, loss) for count, share in simulated])
+        axes.plot(
+            taken, line[:, 1], color=color, linewidth=2.0, marker="o", markersize=4, label=label
+        )
+        axes.fill_between(taken, line[:, 0], line[:, 2], color=color, alpha=0.18, linewidth=0)
+    axes.set_xticks(taken)
     figure.legend(fontsize=8, frameon=False, ncols=2, loc="outside upper right")
     return figure
 
@@ -130,15 +129,14 @@ def view_pictures(audit: Audit, view: Suggestion, way: Way) -> list[tuple[Figure
     """
     labels = audit.source.labels
     pictures: list[tuple[Figure, str]] = []
-    like, share = likest_picture(audit.source, audit.survey, audit.seen, view)
     if audit.source.has_images:
         start = _photo(audit, way.start)
         _draw_turn(start.axes[0], way.turn)
         pictures.append((start, f"stand where {labels[way.start]} was taken"))
-        if share >= _SHOWS:
-            target = _photo(audit, like)
-            _draw_target(target.axes[0], audit, view, like)
-            pictures.append((target, f"take this (here in {labels[like]})"))
+        if way.target is not None:
+            target = _photo(audit, way.target)
+            _draw_target(target.axes[0], audit, view, way.target)
+            pictures.append((target, f"take what is ringed (here in {labels[way.target]})"))
     fine = ScoringConfig(max_range=audit.config.max_range, zbuffer_size=_FINE_BUFFER)
     colors, value = _pictures(audit.seen.state, audit, view.pose, fine)
     if float(np.isfinite(value).mean()) >= _FILLED:

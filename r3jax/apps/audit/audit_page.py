@@ -1,5 +1,6 @@
 """The report of an audit: one HTML page that opens from disk, with everything inside."""
 
+import shlex
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ from r3jax.apps.audit.diagnosis import NOT_KNOWN
 from r3jax.apps.audit.directions import way_to
 from r3jax.apps.audit.ground_plan import COLOR_OF_CAUSE, plan_figure, value_figure
 from r3jax.apps.audit.outputs import suggested_poses
+from r3jax.apps.audit.preview import Preview
+from r3jax.apps.audit.promise import promise
 from r3jax.apps.audit.suggest import Suggestion
 from r3jax.captures.faults.faults import Finding
 from r3jax.files import write_atomic
@@ -29,28 +32,23 @@ _SIDE = 230
 _BAR = 90
 """Width of the bar of a cause that takes everything [px]."""
 
-TITLES = {
-    "blur": "Blurred by motion",
-    "focus": "Out of focus",
-    "brightness": "Brightness changes",
-    "tint": "White balance changes",
-    "pose": "Poses contradict the depth",
-    "scale": "The scale of the depth is wrong",
-    "ray": "Depth is measured along the ray",
-    "camera": "The intrinsics of the camera are wrong",
-    "repeat": "Pictures repeat each other",
-    "stray": "Poses have diverged",
-}
-"""Heading of each kind of finding."""
 
-
-def write_report(audit: Audit, folder: Path, files: Iterable[Path] = ()) -> Path:
+def write_report(
+    audit: Audit,
+    folder: Path,
+    files: Iterable[Path] = (),
+    *,
+    capture: Path | None = None,
+    preview: Preview | None = None,
+) -> Path:
     """Writes `report.html`.
 
     Args:
         audit: what was found.
         folder: a folder that exists.
         files: what lies beside the page, to be named on it.
+        capture: what was audited, for commands that the page names.
+        preview: a splat of the capture, if one was trained.
 
     Returns:
         The page; its images are inside it, so that it can be sent as one file.
@@ -68,9 +66,10 @@ def write_report(audit: Audit, folder: Path, files: Iterable[Path] = ()) -> Path
         cards={},
         state=sentences.state(audit),
         headline=sentences.headline(audit),
-        advice=sentences.advice(audit, TITLES),
+        advice=sentences.advice(audit),
         verdict=sentences.verdict(audit),
         numbers=_cards(audit),
+        seen_from=audit.places.seen_from,
         colors=COLOR_OF_CAUSE,
         is_complete=audit.source.is_complete,
         is_own_path=audit.is_own_path,
@@ -82,7 +81,7 @@ def write_report(audit: Audit, folder: Path, files: Iterable[Path] = ()) -> Path
         block=sentences.length(audit, 1.0),
         region_pictures=None if region_figure is None else to_png(region_figure),
         regions=_regions(audit),
-        gain=to_png(audit_figures.gain_figure(audit)) if audit.plan.views else None,
+        gain=_gain(audit),
         views=_views(audit),
         frames=to_png(audit_figures.frames_figure(audit)),
         worst=to_png(audit_figures.worst_figure(audit)) if is_ranked else None,
@@ -90,10 +89,19 @@ def write_report(audit: Audit, folder: Path, files: Iterable[Path] = ()) -> Path
         panorama=to_png(audit_figures.panorama_strip(audit)),
         method=sentences.method(audit),
         files=[path.name for path in files],
+        stills=[] if preview is None else preview.stills,
+        view_command=f"r3jax view {shlex.quote(str(folder))}",
+        select_command=sentences.select_command(capture),
     )
     path = folder / "report.html"
     write_atomic(path, page.encode())
     return path
+
+
+def _gain(audit: Audit) -> bytes | None:
+    """Draws the promise; without a depth camera there is none."""
+    is_promised = audit.plan.views and audit.source.is_complete
+    return to_png(audit_figures.gain_figure(audit)) if is_promised else None
 
 
 def _cards(audit: Audit) -> dict[str, str]:
@@ -112,10 +120,10 @@ def _cards(audit: Audit) -> dict[str, str]:
         cards["of their pixels is not known"] = f"{100 * audit.shares[audit.unknown]:.0f} %"
     where = "" if audit.source.is_complete else ", where it is known"
     cards[f"mean R of the frames{where}"] = f"{audit.mean_renderability:.2f}"
-    if plan.views:
-        gain = f"{found.mean:.2f} → {plan.after.mean:.2f}"
-        where = "" if audit.source.is_complete else " that are known"
-        cards[f"mean R of the surfaces{where} after {len(plan.views)} views"] = gain
+    if plan.views and audit.source.is_complete:
+        low, _, high = (100 * share for share in promise(plan))
+        what = f"seen well enough after {len(plan.views)} more pictures (in 8 of 10 captures)"
+        cards[what] = f"{low:.0f} to {high:.0f} %"
     return cards
 
 
@@ -171,7 +179,7 @@ def _finding(audit: Audit, finding: Finding) -> dict[str, Any]:
     labels = audit.source.labels
     shown = zip(finding.frames[:_SHOWN], finding.captions, strict=False)
     return {
-        "title": TITLES[finding.kind],
+        "title": sentences.TITLES[finding.kind],
         "what": finding.what,
         "todo": finding.todo,
         "shown": [

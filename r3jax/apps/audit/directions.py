@@ -4,6 +4,7 @@ Shape symbols: n pictures.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from r3jax.captures.capture_maps import Seen
 from r3jax.captures.source import Source, projected
 from r3jax.captures.survey import Survey
 from r3jax.kernels.robot.cells import segments_are_inside
+from r3jax.mapping.occupancy import OccupancyGrid
 
 _STEP = 0.1
 """A person follows steps of this, and no finer [m]."""
@@ -25,9 +27,8 @@ _SAME_PLACE = 0.3
 _ROUND = 10.0
 """A straight line that something blocks counts as so much longer [audit units]."""
 
-_LANDMARK, _NEAR_BY = 25.0, 2.0
-"""A picture shows where to turn to if its axis is within this angle [deg] of the view's, and it was
-taken within this distance [audit units]."""
+_SHOWS = 0.3
+"""An image that shows less of a view than this share does not help to find it."""
 
 _SAMPLED = 500
 """Voxels of a view that are looked for in other images."""
@@ -52,6 +53,9 @@ class Way:
     is_blocked: bool
     """True if something stands between the picture's place and the view's."""
 
+    target: int | None
+    """A picture that shows much of what the view shows; None: there is none."""
+
 
 def spoken_length(length: float, unit: str) -> str:
     """Writes a length as one says it: 40 cm, 1.2 m; of an unknown unit to two digits.
@@ -66,7 +70,17 @@ def spoken_length(length: float, unit: str) -> str:
     return f"{100.0 * rounded:.0f} cm" if rounded < 0.95 else f"{rounded:.1f} m"
 
 
-def steps_between(here: np.ndarray, there: np.ndarray, meter: float, unit: str = "m") -> list[str]:
+Order = Literal["forward", "aside", "straight"]
+"""How one goes: forward or back first, to the side first, or straight."""
+
+
+def steps_between(
+    here: np.ndarray,
+    there: np.ndarray,
+    meter: float,
+    unit: str = "m",
+    order: Order = "forward",
+) -> list[str]:
     """Says how to get from one view to another: go, hold higher, turn, look up.
 
     Forward and left are those of the view where one is, in the plane; a view that looks straight up
@@ -77,27 +91,36 @@ def steps_between(here: np.ndarray, there: np.ndarray, meter: float, unit: str =
         there: the same, of the view to take.
         meter: one of the capture's units in the poses' units.
         unit: its name.
+        order: how one goes.
     """
     forward = _ahead(here)
     left = np.array([-forward[1], forward[0]])
     offset = (there[:3, 3] - here[:3, 3]) / meter
     # In a capture without meters nothing says what a step is.
-    least = 0.5 * _STEP if unit == "m" else 0.0
+    least = max(0.5 * _STEP if unit == "m" else 0.0, 1e-6)
     moves = [
         f"{spoken_length(abs(amount), unit)} {forth if amount > 0 else back}"
         for amount, forth, back in (
             (float(offset[:2] @ forward), "forward", "back"),
             (float(offset[:2] @ left), "to the left", "to the right"),
         )
-        if abs(amount) >= max(least, 1e-6)
+        if abs(amount) >= least
     ]
-    parts = [f"go {' and '.join(moves)}"] if moves else []
+    is_straight = order == "straight" and len(moves) == 2
+    if is_straight:
+        bearing = float(np.degrees(np.arctan2(offset[:2] @ left, offset[:2] @ forward)))
+        side = "left" if bearing > 0 else "right"
+        length = spoken_length(float(np.hypot(*offset[:2])), unit)
+        moves = [f"{length} straight, {_rounded(bearing):.0f}° to the {side} of {_THERE}"]
+    elif order == "aside":
+        moves.reverse()
+    parts = [f"go {' and then '.join(moves)}"] if moves else []
     if abs(offset[2]) >= max(least, 1e-6):
         higher = "higher" if offset[2] > 0 else "lower"
         parts.append(f"hold the camera {spoken_length(abs(float(offset[2])), unit)} {higher}")
     turn, elevation = turn_between(here, there), _elevation(there)
     if abs(elevation) < 80.0:
-        parts.append(_turn_words(turn))
+        parts.append(_face_words(turn) if is_straight else _turn_words(turn))
     way = "up" if elevation > 0 else "down"
     tilt = f"{_rounded(elevation):.0f}° {way}"
     parts.append("hold it level" if abs(elevation) < 0.5 * _TURN else f"tilt it {tilt}")
@@ -136,6 +159,16 @@ def _turn_words(turn: float) -> str:
     return f"turn {_rounded(turn):.0f}° to the {side}"
 
 
+def _face_words(turn: float) -> str:
+    """Says where to turn after going straight: one faces another way by then than the picture."""
+    if abs(turn) < 0.5 * _TURN:
+        return f"face {_THERE}"
+    return f"face {_rounded(turn):.0f}° to the {'left' if turn > 0 else 'right'} of {_THERE}"
+
+
+_THERE = "where that picture looks"
+
+
 def way_to(source: Source, survey: Survey, seen: Seen, view: Suggestion) -> Way:
     """Describes the way to a view, from the nearest picture that nothing stands before.
 
@@ -151,20 +184,21 @@ def way_to(source: Source, survey: Survey, seen: Seen, view: Suggestion) -> Way:
     there = view.pose.copy()
     if view.is_over and np.isfinite(view.feet).all():
         there[:2, 3] = view.feet[:2]
-    steps = steps_between(here, there, meter, survey.unit)
+    steps = steps_between(here, there, meter, survey.unit, _order(here, there, seen.grid))
     if view.is_over:
         steps.insert(1 if len(steps) > 2 else 0, _reach(there, view.pose, meter, survey.unit))
-    landmark = _landmark(poses, view.pose, nearest)
-    if landmark is not None:
-        name = source.labels[int(survey.chosen[landmark])]
-        steps = [f"{s} until you see what {name} shows" if s.startswith("turn") else s
-                 for s in steps]  # fmt: skip
+    like, share = _likest_picture(source, survey, seen, view)
+    target = like if share >= _SHOWS and source.has_images else None
+    if target is not None and target != int(survey.chosen[nearest]):
+        until = f"until you see what is ringed in {source.labels[target]}"
+        steps = [f"{s} {until}" if s.startswith(("turn", "face")) else s for s in steps]
     label = source.labels[int(survey.chosen[nearest])]
     parts = [f"Stand where you took {label}", *steps]
     text = f"{', '.join(parts[:-1])} and {parts[-1]}."
     if is_blocked:
         text += " Something stands between the two places: go round it."
-    return Way(int(survey.chosen[nearest]), text, turn_between(here, view.pose), is_blocked)
+    turn = turn_between(here, view.pose)
+    return Way(int(survey.chosen[nearest]), text, turn, is_blocked, target)
 
 
 def _reach(feet: np.ndarray, pose: np.ndarray, meter: float, unit: str) -> str:
@@ -173,13 +207,31 @@ def _reach(feet: np.ndarray, pose: np.ndarray, meter: float, unit: str) -> str:
     return f"hold the camera {spoken_length(out, unit)} out over what stands there"
 
 
+def _order(here: np.ndarray, there: np.ndarray, grid: OccupancyGrid) -> Order:
+    """Chooses an order of steps in which nothing is in the camera's way, if there is one."""
+    forward, start = _ahead(here), here[:3, 3]
+    offset = there[:3, 3] - start
+    ahead = np.array([*(offset[:2] @ forward * forward), 0.0])
+    level = np.array([*offset[:2], 0.0])
+    corners = {"forward": start + ahead, "aside": start + level - ahead}
+    ends = np.stack([start, there[:3, 3]])
+    for order, corner in corners.items():
+        if not _is_blocked(grid, corner, ends).any():
+            return "forward" if order == "forward" else "aside"
+    return "straight"
+
+
+def _is_blocked(grid: OccupancyGrid, start: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Finds which straight lines from a place [3] to others [n, 3] meet something, [n] bool."""
+    origin, cell = np.asarray(grid.origin, np.float64), float(grid.cell_size)
+    clear = ~np.asarray(grid.occupied)
+    return ~segments_are_inside(clear, (start - origin) / cell, (ends - origin) / cell)
+
+
 def _nearest(poses: np.ndarray, seen: Seen, view: Suggestion) -> tuple[int, bool]:
     """Finds the nearest picture, by place and then by heading; True if the line is blocked."""
     eye = view.pose[:3, 3]
-    origin, cell = np.asarray(seen.grid.origin, np.float64), float(seen.grid.cell_size)
-    is_blocked = ~segments_are_inside(
-        ~np.asarray(seen.grid.occupied), (eye - origin) / cell, (poses[:, :3, 3] - origin) / cell
-    )
+    is_blocked = _is_blocked(seen.grid, eye, poses[:, :3, 3])
     cost = np.linalg.norm(poses[:, :3, 3] - eye, axis=1) + _ROUND * is_blocked
     near = np.flatnonzero(cost <= cost.min() + _SAME_PLACE)
     turn = [abs(turn_between(poses[i], view.pose)) for i in near.tolist()]
@@ -187,17 +239,7 @@ def _nearest(poses: np.ndarray, seen: Seen, view: Suggestion) -> tuple[int, bool
     return best, bool(is_blocked[best])
 
 
-def _landmark(poses: np.ndarray, pose: np.ndarray, start: int) -> int | None:
-    """Finds a picture taken near by that looks where the view looks, or None."""
-    angle = np.degrees(np.arccos(np.clip(poses[:, :3, 2] @ pose[:3, 2], -1.0, 1.0)))
-    gap = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1)
-    angle = np.where(gap <= _NEAR_BY, angle, np.inf)
-    angle[start] = np.inf
-    best = int(np.argmin(angle))
-    return best if angle[best] <= _LANDMARK else None
-
-
-def likest_picture(
+def _likest_picture(
     source: Source, survey: Survey, seen: Seen, view: Suggestion
 ) -> tuple[int, float]:
     """Finds the image with most of what a view shows, and the share of it [0, 1].

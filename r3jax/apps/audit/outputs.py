@@ -1,10 +1,11 @@
-"""What an audit leaves on disk beside its report, all of it in the capture's own coordinates.
+"""What an audit leaves on disk beside its report, in the capture's own coordinates.
 
 voxels.ply                 voxels, colored by renderability from red to green
 causes.ply                 voxels, colored by what they suffer from; the terms as properties
 suggested.json             the suggested views as nerfstudio's camera_path.json
 suggested_transforms.json  the same as a transforms.json
-audit.json                 every number
+audit.json                 every number; `alignment` takes the capture to z up, a meter to the unit
+preview.ply                a splat, in these coordinates (`--preview`)
 """
 
 import dataclasses
@@ -14,10 +15,14 @@ from typing import Any
 
 import numpy as np
 
+from r3jax.apps.audit import sentences
 from r3jax.apps.audit.audit import Audit
 from r3jax.apps.audit.bad_regions import Region
 from r3jax.apps.audit.diagnosis import CAUSES, FEW, FINE, NOT_KNOWN, ViewScore
 from r3jax.apps.audit.ground_plan import cause_colors, score_colors
+from r3jax.apps.audit.preview import NAME as PREVIEW
+from r3jax.apps.audit.promise import promise
+from r3jax.apps.audit.suggest import Suggestion
 from r3jax.captures.camera_paths import write_camera_path, write_path_transforms
 from r3jax.captures.source import Source
 from r3jax.files import write_atomic
@@ -33,13 +38,16 @@ _MAX_BYTES = 1 << 26
 """An audit of 400 pictures takes some hundred kilobytes."""
 
 
-def write_outputs(audit: Audit, folder: Path, capture: Path) -> dict[str, Path]:
+def write_outputs(
+    audit: Audit, folder: Path, capture: Path, *, has_splat: bool = False
+) -> dict[str, Path]:
     """Writes everything but the report.
 
     Args:
         audit: what was found.
         folder: a folder that exists.
         capture: what was audited.
+        has_splat: True if the splat of a preview is there.
 
     Returns:
         The files by what they hold.
@@ -59,7 +67,10 @@ def write_outputs(audit: Audit, folder: Path, capture: Path) -> dict[str, Path]:
         written["transforms"] = folder / "suggested_transforms.json"
         write_camera_path(written["camera path"], poses, audit.lens.camera)
         write_path_transforms(written["transforms"], poses, audit.lens.camera)
-    record = {**record_of(audit), "capture_path": str(capture.resolve())}
+    if has_splat:
+        written["splat"] = folder / PREVIEW
+    splat = PREVIEW if has_splat else None
+    record = {**record_of(audit), "capture_path": str(capture.resolve()), "splat": splat}
     text = json.dumps(record, indent=1, allow_nan=False)
     write_atomic(written["numbers"], (text + "\n").encode())
     return written
@@ -103,6 +114,7 @@ def _write_clouds(audit: Audit, values: Path, causes: Path) -> None:
         "resolution": found.resolution,
         "directions": found.num_directions,
         "observations": np.asarray(state.count),
+        "standpoints": found.num_seen,
         "cause": found.cause,
     }
     write_points(
@@ -120,6 +132,16 @@ def record_of(audit: Audit) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "capture": audit.source.name,
+        "headline": sentences.headline(audit),
+        "causes": [
+            {"name": name, "meaning": sentences.MEANING[name], "do": sentences.REMEDY[name]}
+            for name in CAUSES
+        ],
+        "alignment": {
+            "rotation": survey.alignment.rotation.tolist(),
+            "scale": survey.alignment.scale,
+            "origin": survey.alignment.origin.tolist(),
+        },
         "unit": "metre" if audit.source.is_metric else "unknown",
         "depth_from": audit.source.kind,
         "reconstruction": _reconstruction(audit.source),
@@ -166,6 +188,7 @@ def record_of(audit: Audit) -> dict[str, Any]:
                 "camera_to_world_opengl": (pose @ OPENGL_FROM_OPENCV).tolist(),
                 "rank": view.rank,
                 "held_out_over_something": view.is_over,
+                "stand_at": _stand_at(audit, view),
                 "gain_in_voxels": view.gain,
                 "unseen_cells": len(view.cells),
                 "voxels_shown": len(view.shown),
@@ -183,6 +206,8 @@ def record_of(audit: Audit) -> dict[str, Any]:
             "of_each_picture": audit.faults.record,
         },
         "mean_after_random_views": list(plan.random_mean),
+        "fine_after_random_views": list(plan.random_fine),
+        "promised_fine": list(promise(plan)) if plan.views and audit.source.is_complete else None,
     }
 
 
@@ -204,6 +229,13 @@ def _surfaces(audit: Audit, face: float) -> dict[str, Any]:
         "share": whole if audit.source.is_complete else audit.shares,
         "area": {name: found.share(name) * evaluated * face for name in CAUSES},
     }
+
+
+def _stand_at(audit: Audit, view: Suggestion) -> list[float] | None:
+    """Returns the place on the floor where a person stands, or None if that is not known."""
+    if not np.isfinite(view.feet).all():
+        return None
+    return audit.survey.alignment.points_back(view.feet[None])[0].tolist()
 
 
 def _score(score: ViewScore) -> dict[str, Any]:

@@ -1,11 +1,14 @@
 """The words of an audit, for the page and the console."""
 
+import shlex
 from collections.abc import Iterable
+from pathlib import Path
 
 import numpy as np
 
 from r3jax.apps.audit.audit import SATURATED, Audit
 from r3jax.apps.audit.diagnosis import FEW, FINE, NOT_KNOWN
+from r3jax.apps.audit.promise import promise, random_promise
 from r3jax.apps.audit.suggest import DIRECTIONS, OVERLAP, Suggestion
 from r3jax.captures.alignment import AXES
 
@@ -33,7 +36,7 @@ REMEDY = {
 
 SHORT = {
     "angle": "only from other angles",
-    "rare": "too rarely",
+    "rare": "by one or two pictures only",
     "distance": "only from too far away",
     "noise": "in contradictory colors",
 }
@@ -51,11 +54,28 @@ GOOD, _AGAIN = 0.85, 0.3
 """Shares seen well enough: above the first a capture is good for splats, below the second it should
 be taken again."""
 
+_LEAST_PROMISE = 0.5
+"""Less is no promise [percent]."""
+
 _MOST = 0.5
 """Minimum share of pictures with a pose."""
 
 _SEVERE = ("pose", "scale", "ray", "camera", "stray")
 """Faults that spoil a model even if everything is seen."""
+
+TITLES = {
+    "blur": "Blurred by motion",
+    "focus": "Out of focus",
+    "brightness": "Brightness changes",
+    "tint": "White balance changes",
+    "pose": "Poses contradict the depth",
+    "scale": "The scale of the depth is wrong",
+    "ray": "Depth is measured along the ray",
+    "camera": "The intrinsics of the camera are wrong",
+    "repeat": "Pictures repeat each other",
+    "stray": "Poses have diverged",
+}
+"""Heading of each kind of finding."""
 
 _LEAST_TOLD, _THINGS = 0.03, 3
 """Minimum share of a cause among the things to do, and the maximum number of these."""
@@ -172,7 +192,7 @@ def _surfaces(audit: Audit) -> str:
     parts = [f"{100 * shares[c]:.0f} % is seen {SHORT[c]}" for c in ordered if shares[c] >= 0.005]
     fine = f"{100 * cause_share(audit, 'fine'):.0f} %"
     if audit.source.is_complete:
-        start = f"{fine} of the surface visible from where a person could stand"
+        start = f"{fine} of {audit.places.seen_from}"
     else:
         what = "pictures" if audit.is_own_path else "frames"
         start = (
@@ -185,35 +205,42 @@ def _surfaces(audit: Audit) -> str:
 
 
 def _promises(audit: Audit) -> list[str]:
-    """Describes how the frames would render, and the expected gain of further views."""
-    found, plan = audit.diagnosis, audit.plan
+    """Says how well the frames are covered, and what further views would add."""
     sentences: list[str] = []
     mean = audit.mean_renderability
     worst = audit.frames[int(np.nanargmin(np.r_[audit.renderability, np.inf])) % len(audit.frames)]
-    what = (
-        "A picture, rendered from the other ones," if audit.is_own_path else "A frame of the path"
-    )
+    what = "What a picture shows" if audit.is_own_path else "What a frame of the path shows"
+    by = "by the others" if audit.is_own_path else "by the pictures"
     beside = "" if audit.source.is_complete else ", where it is known"
     if audit.is_saturated:
-        sentences.append(f"{what} has R {mean:.2f} on average. {saturation()}")
+        sentences.append(f"{what} was seen {by} with R {mean:.2f} on average. {saturation()}")
     else:
         sentences.append(
-            f"{what} has R {mean:.2f} on average{beside}; the worst ({worst.label}) has "
+            f"{what} was seen {by} with R {mean:.2f} on average{beside}; least of {worst.label}, "
             f"{worst.score.renderability:.2f}."
         )
-    if plan.views:
-        count = len(plan.views)
-        views, drawn = (
-            ("One further view", "a random view")
-            if count == 1
-            else (f"{count} further views", f"{count} random views")
-        )
-        sentences.append(
-            f"{views} would raise the mean over all{'' if audit.source.is_complete else ' known'} "
-            f"surfaces from {found.mean:.2f} to {plan.after.mean:.2f} (a prediction); {drawn} "
-            f"would raise it to {plan.random_mean[-1]:.2f}."
-        )
+    if audit.plan.views:
+        sentences.append(promised(audit))
     return sentences
+
+
+def promised(audit: Audit) -> str:
+    """Says what the suggested pictures can be expected to bring, and as many at random places."""
+    count = len(audit.plan.views)
+    these = "This picture" if count == 1 else f"These {count} pictures"
+    if not audit.source.is_complete:
+        return f"How much {these[:1].lower()}{these[1:]} would bring is not known without depth."
+    now = 100 * audit.diagnosis.fine_share
+    low, middle, high = (100 * share for share in promise(audit.plan))
+    if middle - now < _LEAST_PROMISE:
+        what = "it" if count == 1 else "they"
+        return f"{now:.0f} % hardly rise any more by pictures: {what} would show what is dark."
+    drawn = 100 * random_promise(audit.plan).middle
+    verb, as_many = ("raises", "one") if count == 1 else ("raise", "as many")
+    return (
+        f"{these} {verb} the {now:.0f} % to about {middle:.0f} % (in eight of ten captures, to "
+        f"between {low:.0f} and {high:.0f} %); {as_many} at random places to about {drawn:.0f} %."
+    )
 
 
 def vertical(audit: Audit) -> str:
@@ -276,6 +303,11 @@ def saturation() -> str:
     )
 
 
+def select_command(capture: Path | None) -> str:
+    """Returns the command that keeps the fewest frames which give nearly all."""
+    return f"r3jax select {'CAPTURE' if capture is None else shlex.quote(str(capture))} --gain 0.95"
+
+
 def listed(parts: list[str]) -> str:
     """Joins words: a, b and c."""
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
@@ -291,11 +323,11 @@ def reason(audit: Audit, view: Suggestion, letters: Iterable[str]) -> str:
     if total:
         named = sorted(view.causes, key=lambda cause: -view.causes[cause])
         shares = [
-            f"{100 * view.causes[c] / total:.0f} % {c}"
+            f"{100 * view.causes[c] / total:.0f} % {SHORT[c]}"
             for c in named
             if view.causes[c] >= 0.005 * total
         ]
-        parts.append(f"it shows {area(audit, total * face)} that is not yet: {', '.join(shares)}")
+        parts.append(f"it shows {area(audit, total * face)} seen too little: {', '.join(shares)}")
     if len(view.cells):
         cells = area(audit, len(view.cells) * audit.survey.cell_size**2)
         parts.append(f"it shows about {cells} that no picture shows")
@@ -358,10 +390,11 @@ def method(audit: Audit) -> list[str]:
         )
     sentences.append(
         f"Views: candidates are {len(audit.places.eyes)} positions {where}, with {DIRECTIONS} "
-        f"directions each; at least {100 * OVERLAP:.0f} % of a view must show known surfaces, so "
+        f"directions each; at least {100 * OVERLAP:.0f} % of a view must show known surfaces, so "
         "that the picture can be registered. The candidate that raises the mean renderability of "
-        "all surfaces most is simulated before the next one is chosen. Colors, and surfaces that "
-        "were never seen, cannot be predicted."
+        "all surfaces most is simulated before the next one is chosen. What is expected is what is "
+        "simulated, less what was missing in embedded scenes in which the pictures were taken "
+        "(docs/results/audit.md)."
     )
     if (moved := origin(audit)) is not None:
         sentences.append(moved)
@@ -395,8 +428,12 @@ def state(audit: Audit) -> str:
     fine = cause_share(audit, "fine")
     if fine < _AGAIN or _posed_share(audit) < _MOST:
         return "again"
-    severe = any(finding.kind in _SEVERE for finding in faults.findings)
-    return "good" if fine >= GOOD and not severe else "gaps"
+    return "good" if fine >= GOOD and not _severe(audit) else "gaps"
+
+
+def _severe(audit: Audit) -> list[str]:
+    """Returns the headings of the faults that spoil a model, however much is seen."""
+    return [TITLES[f.kind] for f in audit.faults.findings if f.kind in _SEVERE]
 
 
 def _posed_share(audit: Audit) -> float:
@@ -416,21 +453,17 @@ def headline(audit: Audit) -> str:
     if model is not None and _posed_share(audit) < _MOST:
         return f"{words}: only {model.posed} of {model.pictures} pictures have a pose."
     fine = f"{100 * cause_share(audit, 'fine'):.0f} %"
+    but = "".join(f" But {title[:1].lower()}{title[1:]}." for title in _severe(audit)[:1])
     if audit.source.is_complete:
-        return f"{words}: {fine} of the visible surface is seen well enough."
+        return f"{words}: {fine} of {audit.places.seen_from} is seen well enough.{but}"
     return (
         f"{words}: {fine} of the pictures' pixels is seen well enough, {_unknown(audit)} is not "
-        "known."
+        f"known.{but}"
     )
 
 
-def advice(audit: Audit, titles: dict[str, str]) -> list[tuple[str, str]]:
-    """Chooses up to three things to do, the most important first: in bold, and the rest.
-
-    Args:
-        audit: what was found.
-        titles: heading of each kind of finding.
-    """
+def advice(audit: Audit) -> list[tuple[str, str]]:
+    """Chooses up to three things to do, the most important first: in bold, and the rest."""
     survey, faults = audit.survey, audit.faults
     if survey.doubt is not None or not faults.fits:
         return [("Check the depth and the poses", survey.doubt or CONTRADICTED)]
@@ -440,7 +473,7 @@ def advice(audit: Audit, titles: dict[str, str]) -> list[tuple[str, str]]:
         ]
     looked = max(1, faults.looked_at)
     found = [
-        (1.0 if f.kind in _SEVERE else len(f.frames) / looked, titles[f.kind], f.todo)
+        (1.0 if f.kind in _SEVERE else len(f.frames) / looked, TITLES[f.kind], f.todo)
         for f in faults.findings
     ]
     found += _about_surfaces(audit)
@@ -449,7 +482,10 @@ def advice(audit: Audit, titles: dict[str, str]) -> list[tuple[str, str]]:
         found.append((audit.shares[NOT_KNOWN], "Let pictures overlap more", unknown))
     if audit.unseen:
         whole = float(audit.diagnosis.is_seen.sum()) * survey.voxel_size**2
-        dark = f"No picture shows about {area(audit, audit.unseen_area)} (dotted on the plan)."
+        dark = (
+            f"No picture shows about {area(audit, audit.unseen_area)} of walls, floor and "
+            "furniture (dotted on the plan)."
+        )
         share = audit.unseen_area / max(audit.unseen_area + whole, 1e-9)
         found.append((share, "Photograph the unseen places", dark))
     found.sort(key=lambda item: -item[0])
@@ -471,7 +507,11 @@ def _about_surfaces(audit: Audit) -> list[tuple[float, str, str]]:
         else "They show the surfaces seen least well; few of the known ones need more views."
     )
     return [
-        (1.0, "Take the picture below" if count == 1 else f"Take the {count} pictures below", rest)
+        (
+            1.0,
+            "Take the picture below" if count == 1 else f"Take the {count} pictures below",
+            f"{rest} {promised(audit)}",
+        )
     ]
 
 

@@ -226,6 +226,9 @@ class SuggestedViews:
     random_mean: tuple[float, ...]
     """Mean renderability of all surfaces after each of as many random views."""
 
+    random_fine: tuple[float, ...]
+    """Share of the surfaces that are fine after each of these."""
+
     @property
     def ranked(self) -> tuple[Suggestion, ...]:
         """The views in the order in which they were chosen: the most useful first."""
@@ -364,10 +367,11 @@ def suggest(
         _suggestion(rank, view, now, after, places)
         for rank, (view, now, after) in enumerate(steps, start=1)
     ]
-    random_mean = _random(state, task, places.eyes, len(views), seed)
+    drawn = _random(state, task, places.eyes, len(views), seed)
+    means, shares = (tuple(getattr(d, name) for d in drawn) for name in ("mean", "fine_share"))
     eyes = np.array([view.pose[:3, 3] for view in views]).reshape(-1, 3)
     walk = tuple(views[i] for i in walking_order(eyes, start))
-    return SuggestedViews(walk, diagnoses[0], diagnoses[-1], random_mean)
+    return SuggestedViews(walk, diagnoses[0], diagnoses[-1], means, shares)
 
 
 def walking_order(eyes: np.ndarray, start: np.ndarray) -> list[int]:
@@ -480,18 +484,20 @@ def _suggestion(
     )
 
 
+def random_poses(places: np.ndarray, num: int, seed: int) -> np.ndarray:
+    """Draws views at random places, in directions as people look: mostly level, [num, 4, 4]."""
+    rng = np.random.default_rng(seed)
+    directions = rng.normal(size=(num, 3)) * [1.0, 1.0, 0.3]
+    return poses_along(places[rng.integers(len(places), size=num)], directions)
+
+
 def _random(
     state: MapState, task: Task, places: np.ndarray, num: int, seed: int
-) -> tuple[float, ...]:
-    """Computes mean renderability after each of `num` random views."""
-    if not num:
-        return ()
-    rng = np.random.default_rng(seed)
-    directions = rng.normal(size=(num, 3)) * [1.0, 1.0, 0.3]  # as people look: mostly level
-    poses = poses_along(places[rng.integers(len(places), size=num)], directions)
-    means: list[float] = []
-    for pose in poses:
+) -> list[Diagnosis]:
+    """Diagnoses the map after each of `num` random views."""
+    found: list[Diagnosis] = []
+    for pose in random_poses(places, num, seed) if num else _NO_POSES:
         T = jnp.asarray(pose, dtype=jnp.float32)
         state, _ = simulate_view(state, task.camera, T, task.config)
-        means.append(task.evaluate(state)[1].mean)
-    return tuple(means)
+        found.append(task.evaluate(state)[1])
+    return found

@@ -1,6 +1,7 @@
-"""`r3jax audit`: finds where a capture fails, how its frames would render, which views to add."""
+"""`r3jax audit`: finds where a capture fails, how well it is covered, which views to add."""
 
 import dataclasses
+import shlex
 import tempfile
 from pathlib import Path
 
@@ -11,10 +12,12 @@ from r3jax.apps.audit.ground_plan import region_letter
 from r3jax.apps.audit.live.follow import follow
 from r3jax.apps.audit.live.guide_page import open_guide
 from r3jax.apps.audit.outputs import audited_capture, suggested_poses, write_outputs
+from r3jax.apps.audit.preview import Preview, train_preview
 from r3jax.apps.audit.settings import AuditSettings
 from r3jax.captures.camera_paths import CameraPath, path_of
 from r3jax.captures.source import Source, source_of
 from r3jax.cli.console import Console, Stages, Table
+from r3jax.cli.errors import one_line
 from r3jax.cli.options.audit import AuditOptions
 from r3jax.cli.parsing import given_words
 from r3jax.errors import InputError
@@ -23,6 +26,7 @@ from r3jax.formats.captures import open_capture
 from r3jax.formats.ros.bags import parse_topics
 from r3jax.interrupts import settle_interrupt
 from r3jax.network import exposure_warning
+from r3jax.splatting.errors import TooLargeError, TrainingDiverged, ViewsError
 
 _SHOWN = 5
 """Regions that the console lists."""
@@ -92,15 +96,29 @@ def _audit(
     with Stages(progress) as stages:
         found = audit(source, options.terms, path, stages.on_progress)
         own_folder(folder, "audit", "give another --out")
+        preview = _preview(found, folder, stages, progress) if options.preview else None
         stages.on_progress("writing the report", 0)
-        written = write_outputs(found, folder, options.capture)
-        page = write_report(found, folder, written.values())
+        written = write_outputs(found, folder, options.capture, has_splat=preview is not None)
+        page = write_report(
+            found, folder, written.values(), capture=options.capture, preview=preview
+        )
     if (moved := sentences.origin(found)) is not None:
         progress.say(moved)
     _show(Console(), found, {"report": page, **written})
+    progress.say(f"in three dimensions: r3jax view {shlex.quote(str(folder))}")
+    progress.say(f"fewest frames to train on: {sentences.select_command(options.capture)}")
     if found.plan.views:
         progress.say("then take the views above, add them to the capture, and")
     progress.next("audit", options.capture, *given_words(options, _REPEATED))
+
+
+def _preview(found: Audit, folder: Path, stages: Stages, progress: Console) -> Preview | None:
+    """Trains a splat to look at, or says why there is none."""
+    try:
+        return train_preview(found, folder, stages.on_progress)
+    except (ViewsError, TooLargeError, TrainingDiverged) as error:
+        progress.say(f"no splat could be trained: {one_line(error)}", style="yellow")
+        return None
 
 
 def _check_folder(folder: Path, capture: Path) -> None:

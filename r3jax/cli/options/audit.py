@@ -48,7 +48,7 @@ class GuideOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class AuditOptions:
-    """Audit a capture: where its splats would fail, how frames would render, which views to add.
+    """Audit a capture: where its splats would fail, how well it is covered, which views to add.
 
     For example
         r3jax audit scans/kitchen
@@ -71,6 +71,10 @@ class AuditOptions:
     topics: Annotated[str | None, arg(metavar="NAMES")] = None
     """Topics and frames of a ROS bag, such as color=/cam/image_raw,pose=/odom; also depth, info,
     depth_info, frame, world. By default they are detected."""
+
+    preview: bool = False
+    """Train a splat on small images, too, in about two minutes: `r3jax view` shows it beside the
+    surfaces."""
 
     terms: Annotated[AuditSettings, _TERMS] = field(default_factory=AuditSettings)
     guide: Annotated[GuideOptions, arg(name="guidance while scanning")] = field(

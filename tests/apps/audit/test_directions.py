@@ -1,14 +1,17 @@
 """Directions lead to the view: what the words say is done, and the camera is where it should be."""
 
 import re
+from itertools import pairwise
 
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from r3jax.apps.audit import directions
 from r3jax.apps.audit.directions import spoken_length, steps_between
 from r3jax.apps.audit.suggest import walking_order
 from tests.apps.audit.room import pose_at
+from tests.captures.test_standpoints import grid_of
 
 NUMBER = r"([\d.]+) (cm|m)"
 
@@ -56,6 +59,59 @@ def test_who_does_as_told_is_there(offset, angles):
     assert np.abs(place - there[:3, 3]).max() <= 0.05 + 1e-6
     assert abs((turned - angles[2] + 180.0) % 360.0 - 180.0) <= 15.0 + 1e-6
     assert abs(tilted - angles[3]) <= 5.0 + 1e-6
+
+
+def legs(here: np.ndarray, text: str) -> np.ndarray:
+    """The corners of the way that words describe, [k, 2]."""
+    forward = here[:2, 2] / np.hypot(*here[:2, 2])
+    axes = {"forward": forward, "back": -forward,
+            "to the left": np.array([-forward[1], forward[0]]),
+            "to the right": np.array([forward[1], -forward[0]])}  # fmt: skip
+    corners = [here[:2, 3]]
+    straight = re.search(rf"{NUMBER} straight, (\d+)° to the (left|right)", text)
+    if straight is not None:
+        angle = np.radians(float(straight[3]) * (1.0 if straight[4] == "left" else -1.0))
+        ahead = np.cos(angle) * forward + np.sin(angle) * axes["to the left"]
+        return np.stack([*corners, corners[0] + amount(text, "straight") * ahead])
+    going = text.split(", ")[0]
+    for number, unit, side in re.findall(
+        f"{NUMBER} (forward|back|to the left|to the right)", going
+    ):
+        step = float(number) * (0.01 if unit == "cm" else 1.0)
+        corners.append(corners[-1] + step * axes[side])
+    return np.stack(corners)
+
+
+@given(st.integers(0, 400))
+def test_a_way_goes_through_nothing_where_one_of_three_does_not(seed):
+    rng = np.random.default_rng(seed)
+    free = rng.random((20, 20, 8)) > 0.06
+    eye, aim = rng.uniform(0.6, 3.4, 3) * [1, 1, 0.3], rng.uniform(0.6, 3.4, 3) * [1, 1, 0.3]
+    heading = rng.uniform(0, 2 * np.pi)
+    here = pose_at(eye, eye + np.array([np.cos(heading), np.sin(heading), 0.0]))
+    there = pose_at(aim, aim + np.eye(3)[0])
+    order = directions._order(here, there, grid_of(free))
+
+    def meets(corners: np.ndarray) -> bool:
+        height = np.r_[np.full(len(corners) - 1, eye[2]), aim[2]]
+        points = np.column_stack([corners, height])
+        line = np.concatenate([a + np.linspace(0, 1, 2000)[:, None] * (b - a)
+                               for a, b in pairwise(points)])  # fmt: skip
+        return bool((~free[tuple((line / 0.2).astype(int).T)]).any())
+
+    forward = here[:2, 2] / np.hypot(*here[:2, 2])
+    ahead = (aim - eye)[:2] @ forward * forward
+    ways = {"forward": np.stack([eye[:2], eye[:2] + ahead, aim[:2]]),
+            "aside": np.stack([eye[:2], aim[:2] - ahead, aim[:2]])}  # fmt: skip
+    if order != "straight":
+        assert not meets(ways[order])
+        said = legs(here, ", ".join(steps_between(here, there, 1.0, order=order)))
+        assert np.abs(said[-1] - aim[:2]).max() <= 0.1
+        if len(said) == 3:  # the same corner as is checked, up to a step
+            assert np.abs(said[1] - ways[order][1]).max() <= 0.1
+    elif not meets(np.stack([eye[:2], aim[:2]])):
+        said = legs(here, ", ".join(steps_between(here, there, 1.0, order=order)))
+        assert np.linalg.norm(said[-1] - aim[:2]) <= 0.05 + 0.12 * np.linalg.norm((aim - eye)[:2])
 
 
 def test_a_picture_that_looks_straight_down_faces_its_upper_edge():

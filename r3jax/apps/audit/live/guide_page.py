@@ -26,17 +26,21 @@ from urllib.parse import urlsplit
 import numpy as np
 from matplotlib import colormaps
 
+from r3jax.apps.audit.bad_regions import unseen_edges
 from r3jax.apps.audit.diagnosis import CAUSES, demand_of, diagnose, score_from_standpoints
 from r3jax.apps.audit.directions import steps_between
 from r3jax.apps.audit.sentences import GOOD, SHORT, listed
+from r3jax.apps.audit.settings import AuditSettings
 from r3jax.captures.capture_maps import free_round
 from r3jax.captures.standpoints import places_of
 from r3jax.captures.survey import RANGE
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
+from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.network import LOOPBACK, check_free
 from r3jax.planning.planner import Planner
 from r3jax.planning.policy import Decision
+from r3jax.planning.robot.explorable import mask_unexplorable
 from r3jax.plots import style
 from r3jax.plots.page import render
 from r3jax.plots.pictures import floor_picture, png, small_png
@@ -228,14 +232,14 @@ class _Handler(BaseHTTPRequestHandler):
         """Says nothing on the console."""
 
 
-_PLACES = 12
-"""Places to stand from which surfaces are scored; an audit takes twice as many."""
+_STANDPOINTS = AuditSettings.num_standpoints
+"""Standpoints from which surfaces are scored, as many as in an audit."""
 
 _HEADROOM = 0.35
 """As in `floor_picture` [m]."""
 
-_FARTHEST = 5.0
-"""Surfaces farther from a place do not count for it [m]."""
+_LEAST_DARK = 1.0
+"""Less needs no sentence [square meters]."""
 
 _MARGIN = 0.6
 """Shown round what is known [m]."""
@@ -249,13 +253,19 @@ class ScanProgress:
     """What is done."""
 
     fine_share: float
-    """Share of the surface visible from where a person could stand that is seen well enough."""
+    """Share of `seen_from` that is seen well enough."""
+
+    seen_from: str
+    """What is evaluated, for the reader."""
 
     causes: dict[str, float]
     """Share of the same of each other cause."""
 
     area: float
     """Area of all that, a voxel's face each [square meters]."""
+
+    dark: float
+    """Area where free space ends in something that no picture shows [square meters]."""
 
     plan: np.ndarray
     """The place from above, surfaces from red to green, [h, w, 3] uint8; row 0 at the largest y."""
@@ -271,10 +281,13 @@ class ScanProgress:
             if share >= 0.01
         ]
         text = (
-            f"{100 * self.fine_share:.0f} % of the visible surface is seen well enough "
-            f"({self.area:.0f} m² in {pictures} pictures)"
+            f"{100 * self.fine_share:.0f} % of {self.seen_from} is seen "
+            f"well enough ({self.area:.0f} m² of floor, walls and furniture, "
+            f"{pictures} pictures)"
         )
         rest = f"; seen {listed(parts)}." if parts else "."
+        if self.dark >= _LEAST_DARK:
+            rest += f" About {self.dark:.0f} m² no picture shows yet (gray beside white)."
         end = " That is good for splats: you can stop here." if self.fine_share >= GOOD else ""
         return text + rest + end
 
@@ -291,14 +304,25 @@ def scan_progress(planner: Planner, camera: Camera, places: np.ndarray) -> ScanP
     config = ScoringConfig(max_range=RANGE)
     # As an audit does it: the camera was there, whatever the sensor says of places so near.
     grid = free_round(planner.grid, places)
-    stand = places_of(state, grid, places, _PLACES, is_dense=True, meter=1.0).standing
-    demand = demand_of(state, stand, config)
+    num = AuditSettings.num_places
+    stand = places_of(state, grid, places, num, is_dense=True, meter=1.0)
+    demand = demand_of(state, stand.standing[:_STANDPOINTS], config)
     found = diagnose(state, demand, score_from_standpoints(state, demand, camera.focal, config))
     value = np.where(found.is_seen, found.value, np.nan)
     causes = {name: found.share(name) for name in CAUSES if name != "fine"}
     area = float(found.is_seen.sum()) * float(state.voxel_size) ** 2
     plan, extent = _plan(planner, value, places)
-    return ScanProgress(found.fine_share, causes, area, plan, extent)
+    dark = _dark_area(grid, places)
+    return ScanProgress(found.fine_share, stand.seen_from, causes, area, dark, plan, extent)
+
+
+def _dark_area(grid: OccupancyGrid, places: np.ndarray) -> float:
+    """Measures where free space that can be reached ends in unseen space [square meters]."""
+    cell, reached = float(grid.cell_size), np.zeros(grid.log_odds.shape, dtype=bool)
+    cells = np.floor((places - np.asarray(grid.origin)) / cell).astype(np.int64)
+    reached[tuple(cells.clip(0, np.array(reached.shape) - 1).T)] = True
+    explorable = np.asarray(mask_unexplorable(grid, reached).unexplored)
+    return float(unseen_edges(grid, explorable).sum()) * cell * cell
 
 
 def _plan(

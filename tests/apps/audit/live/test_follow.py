@@ -109,7 +109,7 @@ def test_the_page_needs_nothing_from_elsewhere_and_answers_its_own_name_only():
 
 def test_surfaces_seen_from_all_sides_are_done_and_others_not():
     config = r3jax.MappingConfig(capacity=1 << 13)
-    shares = []
+    shares, dark = [], []
     for count in (1, 10):
         planner = r3jax.start(LENS.camera, BOUNDS, "random", config=config)
         for pose in POSES[:count]:
@@ -117,4 +117,6 @@ def test_surfaces_seen_from_all_sides_are_done_and_others_not():
         done = scan_progress(planner, LENS.camera, POSES[:, :3, 3])
         assert done.fine_share + sum(done.causes.values()) == pytest.approx(1.0)
         shares.append(done.fine_share * done.area)
+        dark.append(done.dark)
     assert shares[1] > 3 * shares[0] > 0
+    assert dark[0] > 2 * dark[1]
