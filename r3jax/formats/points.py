@@ -77,16 +77,26 @@ def read_points(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
         FormatError: the file is missing, not a PLY or cut off; the vertices are not its first
             element, have lists or no position, or one that is not finite.
     """
-    path = Path(path)
-    with naming(path):
-        data = read_bytes(path, _MAX_BYTES)
-        vertices = _header(data)
-        table = _text_table(data, vertices) if not vertices.order else _table(data, vertices)
-        xyz = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    table = read_point_table(path)
+    xyz = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    with naming(Path(path)):
         if not np.all(np.isfinite(xyz)):
             bad = int(np.argmin(np.isfinite(xyz).all(axis=1)))
             raise ForeignFileError(f"the position of point {bad} is not finite")
         return xyz, _colors(table)
+
+
+def read_point_table(path: Path | str) -> np.ndarray:
+    """Reads all properties of the vertices, a structured array [n].
+
+    Raises:
+        FormatError: as `read_points`, but for positions that are not finite.
+    """
+    path = Path(path)
+    with naming(path):
+        data = read_bytes(path, _MAX_BYTES)
+        vertices = _header(data)
+        return _text_table(data, vertices) if not vertices.order else _table(data, vertices)
 
 
 def _header(data: bytes) -> _Vertices:

@@ -41,9 +41,15 @@ def busy_port():
         yield other.getsockname()[1]
 
 
-def test_a_folder_that_is_no_run_is_told(tmp_path, capsys):
-    assert "this folder is not a run" in say(["view", tmp_path], capsys)
+def test_a_folder_that_is_nothing_to_look_at_is_told(tmp_path, capsys):
+    pytest.importorskip("viser", reason="the viewer needs viser, which is not installed")
+    assert "a run (run.json)" in say(["view", tmp_path], capsys)
     assert "there is no such folder" in say(["view", tmp_path / "nowhere"], capsys)
+
+
+def test_options_of_runs_are_refused_for_captures(tmp_path, capsys):
+    for option in ("--name", "--export"):
+        assert option in say(["view", tmp_path, option, "other"], capsys)
 
 
 def test_a_run_without_views_is_told(path, tmp_path, capsys):

@@ -5,6 +5,7 @@ import shlex
 import time
 from collections import deque
 from pathlib import Path
+from typing import Protocol
 
 from r3jax.apps.forecast.forecast import Outlook
 from r3jax.apps.forecast.psnr import default_calibration, read_calibration
@@ -274,38 +275,72 @@ def run_view(options: ViewOptions) -> int:
             something, a missing package.
     """
     console = Console(stderr=True)
+    if not options.is_run:
+        _show_page(options, _scan_page(options), console)
+        return 0
     run = read_run(options.path)
     if not run.rows:
         raise InputError(f"{run.path}: the run has no views yet")
     config_of(run)  # says what is wrong with it
     if options.export is not None:
         return _export_images(run, options.export, options.video, console)
-    _show_page(options, run, console)
+    _show_page(options, _run_page(options, run), console)
     return 0
 
 
-def _show_page(options: ViewOptions, run: Run, console: Console) -> None:
-    """Shows the page until Ctrl-C.
+class _Page(Protocol):
+    """A page that is being shown."""
+
+    @property
+    def url(self) -> str: ...
+
+
+def _run_page(options: ViewOptions, run: Run) -> contextlib.AbstractContextManager[_Page]:
+    """Prepares the page of a run.
 
     Raises:
         InputError: viser is not installed.
-        ValueError, OSError: as `open_run_page`.
     """
     check_viser()
     from r3jax.apps.viewer.pages import open_run_page  # needs viser
 
+    return open_run_page(
+        run,
+        host=options.host,
+        port=options.port,
+        allow=options.allow,
+        model=options.name,
+        with_scene=not options.no_scene,
+    )
+
+
+def _scan_page(options: ViewOptions) -> contextlib.AbstractContextManager[_Page]:
+    """Prepares the page of an audit, a capture or a splat.
+
+    Raises:
+        InputError: viser is not installed, or an audit of another version.
+        ValueError, OSError: neither of them, or a damaged one.
+    """
+    check_viser()
+    from r3jax.apps.viewer.scan import open_scan_page, scan_of  # needs viser
+
+    return open_scan_page(
+        scan_of(options.path), host=options.host, port=options.port, allow=options.allow
+    )
+
+
+def _show_page(
+    options: ViewOptions, page: contextlib.AbstractContextManager[_Page], console: Console
+) -> None:
+    """Shows a page until Ctrl-C.
+
+    Raises:
+        ValueError, OSError: as `open_run_page` and `open_scan_page`.
+    """
     if warning := exposure_warning(options.host, "sees the page, and can use it"):
         console.say(warning, style="yellow")
     with contextlib.ExitStack() as stack:
-        page = open_run_page(
-            run,
-            host=options.host,
-            port=options.port,
-            allow=options.allow,
-            model=options.name,
-            with_scene=not options.no_scene,
-        )
-        with console.status("opening the run ..."):
+        with console.status("opening ..."):
             shown = stack.enter_context(page)
         with deferred_interrupt() as was_interrupted:
             console.say(f"view      {shown.url}")

@@ -142,15 +142,17 @@ class ExportOptions:
 class ViewOptions:
     """View a run in the browser: the map over time, and the view of a camera that you drag.
 
-    With --export, write the images without a browser.
+    Of an audit or a capture: surfaces, pictures and splat, and details of a surface that you click.
+    With --export, write the images of a run without a browser.
 
     For example
         r3jax view runs/demo
+        r3jax view runs/audit/kitchen
         r3jax view runs/demo --export pictures --video
     """
 
-    path: Annotated[Path, Positional, arg(metavar="RUN")]
-    """A run folder."""
+    path: Annotated[Path, Positional, arg(metavar="FOLDER")]
+    """A run folder, the folder of an audit, a capture (as for `r3jax audit`), or a splat (.ply)."""
 
     port: int = 8080
     """Port of the page; 0 takes any free one."""
@@ -175,12 +177,24 @@ class ViewOptions:
     """With --export: also write a video of the run (MP4)."""
 
     def __post_init__(self) -> None:
-        """Refuses a path that is not a run, and --video without --export."""
-        check_run(self.path)
+        """Refuses a path that cannot be shown, and --video without --export."""
+        if self.is_run:
+            check_run(self.path)
+        else:
+            if self.path.suffix.lower() != ".ply" or not self.path.is_file():
+                check_capture(self.path)
+            for option, value in (("--name", self.name), ("--export", self.export)):
+                if value is not None:
+                    raise InputError(f"{option} is for runs: {self.path} has no run.json")
         if self.name is not None:
             check_folder_name(self.name)
         if self.video and self.export is None:
             raise InputError("--video belongs to --export FOLDER")
+
+    @property
+    def is_run(self) -> bool:
+        """True for a run; an audit, a capture and a splat have a page of their own."""
+        return (self.path / "run.json").exists()
 
 
 @dataclass(frozen=True)
