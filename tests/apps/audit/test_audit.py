@@ -279,7 +279,7 @@ def test_without_depth_images_what_no_point_shows_is_not_known(cloud, corner):
     assert shares.keys() == {*CAUSES, NOT_KNOWN}
     assert 0.0 < shares[NOT_KNOWN] < 1.0
     said = " ".join(verdict(cloud))
-    assert re.search(rf"\b{100 * shares['fine']:.0f}\s% of what the pictures show", said)
+    assert re.search(rf"\b{100 * shares['fine']:.0f}\s% of the pixels", said)
     assert re.search(rf"\b{100 * shares[NOT_KNOWN]:.0f}\s% is not known", said)
     assert "not known" not in " ".join(verdict(corner))
 
