@@ -38,7 +38,7 @@ def running_count(flags: Bool[Array, " n"]) -> Int[Array, " n"]:
     # float32 has every integer up to 2^24; beyond, counts would be rounded.
     if flags.shape[0] >= 1 << 24:
         raise InputError(
-            f"running_count is exact below 2^24 flags, got {flags.shape[0]}: a map of so many rows "
+            f"running_count is exact below 2^24 flags, got {flags.shape[0]}: a map of that size "
             "is held in tiles (MappingConfig(tiles=True))"
         )
     return _inclusive_sum(flags.astype(jnp.float32)).astype(jnp.int32)

@@ -39,7 +39,7 @@ ACROSS = 5
 
 HYSTERESIS = 0.5
 """The block stays until the robot is so far out of its middle tile [m]: on a border it would move
-to and fro."""
+back and forth."""
 
 VOXELS_PER_AREA = 2.5
 """Voxels over one square of the floor as large as a voxel's face: floor, ceiling and walls of rooms
