@@ -16,10 +16,10 @@ import jax
 import numpy as np
 import trimesh
 import tyro
-from r3jax.exploration.clock import compilations
 
 import r3jax
 from experiments.world_size import DOOR, HEIGHT, ROOM
+from r3jax.exploration.state import compilations
 from r3jax.mapping.occupancy import FREE_LOG_ODDS, OCCUPIED_LOG_ODDS
 from r3jax.mapping.tiles import unpacked_layer
 from r3jax.mapping.update import integrate_growing
