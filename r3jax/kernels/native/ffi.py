@@ -12,6 +12,7 @@ and nothing can wait for a thread of XLA's pool while it occupies the only one.
 
 import contextlib
 import functools
+import hashlib
 import inspect
 import os
 import tempfile
@@ -197,7 +198,9 @@ def num_workers() -> int:
 def _one_process_at_a_time(name: str) -> Generator[None]:
     """Waits for other processes that compile the same: what they leave on the disk is found."""
     user = os.getuid() if hasattr(os, "getuid") else ""  # on Windows the folder is the user's own
-    path = Path(tempfile.gettempdir()) / f"r3jax-{user}-{name}.lock"
+    # Another checkout finds nothing of what this one leaves.
+    here = hashlib.sha256(__file__.encode()).hexdigest()[:8]
+    path = Path(tempfile.gettempdir()) / f"r3jax-{user}-{here}-{name}.lock"
     with contextlib.ExitStack() as held:
         # A file that cannot be written, or is a link: both compile.
         with contextlib.suppress(OSError):
