@@ -196,7 +196,7 @@ DAMAGED = {
     "no info": (Robot(info=False), f"no camera_info for {COLOR}: record it"),
     "no tf": (
         without("/tf"),
-        "camera_color_optical_frame.* was, tf only has .*camera_link in base_link: record /tf",
+        "camera_color_optical_frame.*camera_link in base_link: record /tf",
     ),
     "no static": (
         without("/tf_static", pose="odometry"),

@@ -196,7 +196,7 @@ DAMAGES = {
         ("intrinsic/", None, None, "--export_poses"),
     ],
     "sens": [
-        ("sens", 0, b"\3", "version is 3"),
+        ("sens", 0, b"\3", "version 3"),
         ("sens", 4, (1 << 40).to_bytes(8, "little"), "1099511627776"),
         ("sens", 283, b"\0", "0 and 1"),
         ("sens", 291, (1 << 20).to_bytes(4, "little"), "16777216 pixels"),

@@ -60,7 +60,7 @@ STATEMENTS = {
         "UPDATE Data SET calibration = ?", (2 * rtabmap.calibration(),), "several cameras",
     ),
     "cut off": (
-        "UPDATE Data SET calibration = ?", (rtabmap.calibration()[:80],), "node 5 is cut off",
+        "UPDATE Data SET calibration = ?", (rtabmap.calibration()[:80],), "node 5",
     ),
     "no depth": ("UPDATE Data SET depth = NULL", (), "of 4 images in it none has depth"),
     "empty": ("DELETE FROM Data", (), "4 nodes and no image: .*Mem/BinDataKept"),

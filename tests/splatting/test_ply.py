@@ -1,6 +1,7 @@
 """Scene files: what is written is read again, and other programs' files are read as they are."""
 
 import hashlib
+import re
 import struct
 
 import equinox as eqx
@@ -277,13 +278,13 @@ def test_a_file_that_is_cut_off(tmp_path_factory, missing):
     data = binary_file(columns_of(simple_scene(1)))
     left = (COUNT * 23 * 4 - missing) // (23 * 4)
     reason = refused(tmp_path_factory.mktemp("ply"), data[:-missing])
-    assert f"promises {COUNT} Gaussians, {left} are there" in reason
+    assert re.findall(r"(\d+) Gaussians.* (\d+)", reason) == [(f"{COUNT}", f"{left}")]
 
 
 def test_absurd_counts_are_found_before_memory_is_asked_for(tmp_path):
     data = binary_file(columns_of(simple_scene(1)))
     data = data.replace(b"vertex 5", b"vertex 999999999999999999999")
-    assert "cut off" in refused(tmp_path, data)
+    assert "999999999999999999999" in refused(tmp_path, data)
 
 
 def text_file(rows: list[str]) -> bytes:
@@ -297,7 +298,7 @@ GOOD_ROW = "0 0 0 0 0 0 0 0 0 0 1 0 0 0"
 @pytest.mark.parametrize(
     ("row", "reason"),
     [
-        ("0 0 0 0 0 0 0 0 0 0 1 0 0", "2 Gaussians, 1 "),
+        ("0 0 0 0 0 0 0 0 0 0 1 0 0", "2 Gaussians"),
         ("0 0 0 0 0 0 0 0 0 0 1 0 0 zero", "no table of numbers"),
         ("0 0 nan 0 0 0 0 0 0 0 1 0 0 0", "1 of 2 Gaussians have parameters that are not finite, "
          "the first in row 1: z is nan"),
