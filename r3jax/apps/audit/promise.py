@@ -32,7 +32,7 @@ class Promise(NamedTuple):
 
 
 def promise(plan: SuggestedViews) -> Promise:
-    """Computes the interval in which eight of ten captures were after the suggested pictures."""
+    """Computes the interval in which most captures of the experiment were after the pictures."""
     return expected(plan.after.fine_share, len(plan.views), LOSS)
 
 

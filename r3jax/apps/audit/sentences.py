@@ -238,7 +238,7 @@ def promised(audit: Audit) -> str:
     drawn = 100 * random_promise(audit.plan).middle
     verb, as_many = ("raises", "one") if count == 1 else ("raise", "as many")
     return (
-        f"{these} {verb} the {now:.0f} % to about {middle:.0f} % (in eight of ten captures, to "
+        f"{these} {verb} the {now:.0f} % to about {middle:.0f} % (in most simulated captures, to "
         f"between {low:.0f} and {high:.0f} %); {as_many} at random places to about {drawn:.0f} %."
     )
 
