@@ -1,6 +1,6 @@
-"""One capture, audited: the map, the diagnosis of every surface, the frames, the views to take.
+"""Audits a capture: maps it, diagnoses every surface, evaluates its frames and suggests views.
 
-Shape symbols: n frames of the path that is evaluated.
+Shape symbols: n frames of the evaluated path.
 """
 
 import dataclasses
@@ -46,12 +46,12 @@ from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.utility import visible_unexplored
 
 _UNSEEN_WEIGHT = 0.05
-"""A cell at the edge of the known counts as this share of the voxels that it may hide: who audits a
-capture wants it to render well first, and larger second."""
+"""Weight of a cell at the edge of known space, as a share of the voxels that it may hide. It is
+below 1 because an audit first improves what was captured, and only then extends it."""
 
 SATURATED = 0.9
-"""Mean renderability of frames from which on it ranks none of them: of a kitchen of 250 pictures,
-each held out once, it was 0.96, and its rank correlation with PSNR -0.00."""
+"""Mean renderability above which R no longer ranks the frames. In a capture of a kitchen with 250
+pictures, each held out once, the mean was 0.96 and the rank correlation of R with PSNR -0.00."""
 
 _MAX_FAILED_LOOKS = 3
 """A cell still unexplored after this many images that should show it is given up."""
@@ -59,24 +59,24 @@ _MAX_FAILED_LOOKS = 3
 
 @dataclass(frozen=True)
 class EvaluatedFrame:
-    """One frame of the path that is evaluated."""
+    """One frame of the evaluated path."""
 
     index: int
-    """Number of the image in the capture, or of the pose in the path."""
+    """Index of the image in the capture, or of the pose in the path."""
 
     label: str
-    """How the reader calls it."""
+    """Name of the frame in reports."""
 
     pose: np.ndarray
     """`T_world_camera`, [4, 4] float64 [audit units]."""
 
     score: ViewScore
-    """How well it would render."""
+    """Predicted render quality."""
 
 
 @dataclass(frozen=True)
 class Audit:
-    """Everything that an audit found. Lengths and poses are the audit's; see `survey.alignment`."""
+    """Result of an audit. Lengths and poses are in audit coordinates; see `survey.alignment`."""
 
     source: Source
     survey: Survey
@@ -85,71 +85,72 @@ class Audit:
     """Settings of all scores."""
 
     lens: Lens
-    """Lens of the suggested views: that of most images."""
+    """Lens of the suggested views: the most common lens of the capture."""
 
     places: Places
-    """Where views were looked for."""
+    """Positions that were searched for views."""
 
     standpoints: np.ndarray
-    """From where surfaces were evaluated, the first places to stand, [q, 3] [audit units]."""
+    """Positions from which surfaces were evaluated: the first of the standing places, [q, 3] [audit
+    units]."""
 
     is_object: bool
-    """True if the cameras look inward: the places are the dome of cameras round an object."""
+    """True if the cameras look inward: the places then form a dome of cameras around an object."""
 
     frames: tuple[EvaluatedFrame, ...]
-    """The path."""
+    """Frames of the evaluated path."""
 
     is_own_path: bool
-    """True if the path is the capture's own: every frame was evaluated without its fold."""
+    """True if the path is the capture's own, whose frames are evaluated without their fold."""
 
     regions: tuple[Region, ...]
     """Surfaces that render badly, the worst first."""
 
     unseen: tuple[Region, ...]
-    """Where the capture ends although one could look on; none without depth images."""
+    """Unseen places at the edge of the capture that could be seen; empty without depth images."""
 
     blank: tuple[Region, ...]
-    """Places that pictures show and of which no surface is known; none with a depth camera."""
+    """Places that pictures show but where no surface is known; empty with a depth camera."""
 
     unseen_area: float
-    """Area of all such places [square audit units]."""
+    """Total area of unseen places [square audit units]."""
 
     plan: SuggestedViews
-    """Views to take, and what they promise."""
+    """Suggested views and their expected gain."""
 
     faults: Faults
-    """What is wrong with single frames: blur, light, poses, repetition."""
+    """Faults of single frames: blur, light, poses, repetition."""
 
     @property
     def diagnosis(self) -> Diagnosis:
-        """Diagnosis of every voxel, of the capture as it is."""
+        """Diagnosis of every voxel in the capture's current state."""
         return self.plan.before
 
     @property
     def camera(self) -> Camera:
-        """Camera of the suggested views, thinned out as the map's images were."""
+        """Camera of the suggested views, subsampled like the images of the map."""
         return thinned(self.lens.camera, self.source.stride)
 
     @property
     def is_saturated(self) -> bool:
-        """True where frames render so well, as far as R can tell, that R does not rank them."""
+        """True if the frames' mean R is so high that R no longer ranks them."""
         return self.mean_renderability >= SATURATED
 
     @property
     def all_regions(self) -> tuple[Region, ...]:
-        """Every region, in the order of their letters."""
+        """All regions, in the order of their letters."""
         return (*self.regions, *self.blank, *self.unseen)
 
     @property
     def unknown(self) -> str:
-        """Name of the share of pixels without a known surface."""
+        """Cause reported for pixels without a known surface."""
         return "unseen" if self.source.is_complete else NOT_KNOWN
 
     @property
     def shares(self) -> dict[str, float]:
-        """Share of what the frames show of each cause, and of what is unseen or not known.
+        """Share of the frames' pixels with each cause, and of those that are unseen or not known.
 
-        They sum to 1. Of the capture's own pictures those without depth are counted, as unseen.
+        They sum to 1. The capture's own pictures without depth are included, as unseen.
         """
         blank = len(self.faults.without_depth) if self.is_own_path else 0
         total = len(self.frames) + blank
@@ -159,12 +160,12 @@ class Audit:
 
     @property
     def renderability(self) -> np.ndarray:
-        """Renderability of every frame of the path, [n]; NaN where nothing it shows is known."""
+        """Renderability of every frame of the path, [n]; NaN for frames without a known surface."""
         return np.array([frame.score.renderability for frame in self.frames])
 
     @property
     def mean_renderability(self) -> float:
-        """Mean over the frames; without a depth camera over all their pixels that are known."""
+        """Mean over the frames; without a depth camera, over all their known pixels."""
         value = self.renderability
         if self.source.is_complete:
             return float(value.mean())
@@ -173,8 +174,8 @@ class Audit:
 
 
 Progress = Callable[[str, int], None]
-"""Called with the name of a stage and the number of its steps when it begins; and with an empty
-name after each step."""
+"""Progress callback: called with the name of a stage and its number of steps when the stage begins,
+and with an empty name after each step."""
 
 
 def audit(
@@ -187,14 +188,14 @@ def audit(
 
     Args:
         source: the capture.
-        settings: what the user decides.
-        path: poses to be evaluated, in the capture's coordinates; None: the capture's own.
-        on_progress: for a progress bar.
+        settings: the user's settings.
+        path: poses to evaluate, in the capture's coordinates; None for the capture's own.
+        on_progress: progress callback.
 
     Raises:
-        ValueError: a wish that makes no sense; depth images that contradict the poses; fewer than
-            two images whose depth is known.
-        FormatError: fewer than two images can be read, or nothing is said of depth.
+        ValueError: a setting is invalid; depth images contradict the poses; or fewer than two
+            images have known depth.
+        FormatError: fewer than two images can be read, or there is no source of depth.
         RunError: a file of a run is missing or broken.
     """
     settings = AuditSettings() if settings is None else settings
@@ -284,7 +285,7 @@ def _evaluated_frames(
 ) -> Iterator[EvaluatedFrame]:
     """Yields the evaluated frames of the path.
 
-    The capture's own frames are evaluated without the fold that they are in.
+    The capture's own frames are evaluated on the map without their fold.
     """
     known = None if source.is_complete else known_rows(seen.state, is_complete=False)
     if path is not None:
@@ -326,10 +327,10 @@ def _open_grid(
 ) -> OccupancyGrid:
     """Returns the grid in which only the edges of the seen space are unexplored.
 
-    An edge is where free space ends although it could have been seen.
+    An edge is a cell beside free space that could have been seen but was not.
     """
     grid = seen.grid
-    if not source.is_complete:  # what borders on free space may have been in view, and is not known
+    if not source.is_complete:  # cells beside free space may have been in view without a depth
         return grid.ignoring(grid.unexplored)
     cells = np.floor((cameras - np.asarray(grid.origin)) / float(grid.cell_size)).astype(np.int64)
     cells = cells.clip(0, np.array(grid.log_odds.shape) - 1)

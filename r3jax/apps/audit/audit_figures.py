@@ -1,4 +1,4 @@
-"""The figures of an audit, except the map from above."""
+"""Draws the figures of an audit, except the map from above."""
 
 from dataclasses import dataclass
 
@@ -25,16 +25,16 @@ from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.renderability import term_images
 
 _FINE_BUFFER = 320
-"""Pixels along the longer side of images of the map."""
+"""Longer side of images of the map [px]."""
 
 _SIDE = 2.4
 """Width of a picture beside a view [inch]."""
 
 _FILLED = 0.4
-"""A view of which the map shows less than this share of the pixels looks like nothing."""
+"""Minimum share of a view's pixels that the map must show; otherwise it is not recognizable."""
 
 _NEAREST = 0.1
-"""What is nearer to a camera is not in its image [audit units]."""
+"""Near plane: points closer to a camera are not in its image [audit units]."""
 
 _EMPTY = 0.93
 """Gray of pixels that show no voxel."""
@@ -43,7 +43,7 @@ _EMPTY = 0.93
 def frames_figure(audit: Audit) -> Figure:
     """Draws the renderability of every frame along the path, and its histogram.
 
-    The colors show what costs each frame most.
+    The colors show the main cause of each frame's deficit.
     """
     figure = style.new_figure(10.0, 3.2)
     left, right = figure.subplots(1, 2, width_ratios=[2.6, 1.0], sharey=True)
@@ -57,11 +57,11 @@ def frames_figure(audit: Audit) -> Figure:
     left.set_ylim(0.0, 1.0)
     handles = [
         Line2D([], [], marker="o", linestyle="none", markersize=5, color=COLOR_OF_CAUSE[cause],
-               label=f"costs most: {cause}")
+               label=f"main cause: {cause}")
         for cause in dict.fromkeys(causes)
     ]  # fmt: skip
     left.legend(handles=handles, fontsize=8, frameon=False, loc="lower left", ncols=len(handles))
-    style.dress(right, "How many frames", "frames")
+    style.dress(right, "Distribution", "frames")
     right.hist(value, bins=np.linspace(0.0, 1.0, 21).tolist(), orientation="horizontal",
                color=style.ACCENT, alpha=0.75)  # fmt: skip
     mean = audit.mean_renderability
@@ -74,9 +74,7 @@ def frames_figure(audit: Audit) -> Figure:
 def gain_figure(audit: Audit) -> Figure:
     """Draws the share seen well enough after suggested pictures, and after random ones."""
     figure = style.new_figure(10.0, 2.7)
-    axes = style.dress(
-        figure.subplots(), "What the pictures promise", "pictures taken", "seen well enough [%]"
-    )
+    axes = style.dress(figure.subplots(), "Expected gain", "pictures taken", "seen well enough [%]")
     before = audit.diagnosis.fine_share
     taken = np.arange(len(audit.plan.views) + 1)
     for shares, loss, color, label in (
@@ -122,10 +120,10 @@ def panorama_strip(audit: Audit, count: int = 3) -> Figure:
 
 
 def view_pictures(audit: Audit, view: Suggestion, way: Way) -> list[tuple[Figure, str]]:
-    """Draws what helps to find a view, each with its caption.
+    """Draws pictures that help to find a view, each with its caption.
 
-    The picture where one stands, with an arrow to where to turn; the one that shows most of what
-    is to be taken, with a ring round it; and the map from there, where it shows enough.
+    They are the picture taken where to stand, with an arrow for the turn; the picture that shows
+    most of the target, with a ring around it; and the map rendered at the view, if it shows enough.
     """
     labels = audit.source.labels
     pictures: list[tuple[Figure, str]] = []
@@ -136,12 +134,12 @@ def view_pictures(audit: Audit, view: Suggestion, way: Way) -> list[tuple[Figure
         if way.target is not None:
             target = _photo(audit, way.target)
             _draw_target(target.axes[0], audit, view, way.target)
-            pictures.append((target, f"take what is ringed (here in {labels[way.target]})"))
+            pictures.append((target, f"take the ringed surface (here in {labels[way.target]})"))
     fine = ScoringConfig(max_range=audit.config.max_range, zbuffer_size=_FINE_BUFFER)
     colors, value = _pictures(audit.seen.state, audit, view.pose, fine)
     if float(np.isfinite(value).mean()) >= _FILLED:
-        pictures.append((_picture(colors), "what is known of it, seen from there"))
-        pictures.append((_picture(value), "how well that was seen: red to green"))
+        pictures.append((_picture(colors), "the map so far, from this view"))
+        pictures.append((_picture(value), "how well it was seen so far: red to green"))
     return pictures
 
 
@@ -165,7 +163,7 @@ def _picture(picture: np.ndarray) -> Figure:
 
 
 def _draw_turn(axes: Axes, turn: float) -> None:
-    """Draws an arrow to the side to which to turn [deg], longer for a larger turn."""
+    """Draws an arrow toward the side to turn to [deg], longer for a larger turn."""
     if abs(turn) < 10.0:
         return
     reach = 0.12 + 0.3 * min(abs(turn), 180.0) / 180.0
@@ -179,7 +177,7 @@ def _draw_turn(axes: Axes, turn: float) -> None:
 
 
 def _draw_target(axes: Axes, audit: Audit, view: Suggestion, index: int) -> None:
-    """Draws a ring around the middle of what a view shows, in an image of the capture."""
+    """Draws a ring around the center of a view's visible surface, in an image of the capture."""
     pose = audit.survey.alignment.poses(audit.source.poses[[index]])[0]
     centers = np.asarray(audit.seen.state.center, np.float64).T[view.shown]
     found = projected(audit.source.camera(index), pose, centers, _NEAREST)
@@ -199,7 +197,7 @@ def worst_frames(audit: Audit, count: int = 4) -> list[EvaluatedFrame]:
 
 
 def worst_figure(audit: Audit, count: int = 4) -> Figure:
-    """Draws the worst frames: the image, or else the map, above its renderability."""
+    """Draws the worst frames: the image (or the map if there is none) above its renderability."""
     fine = ScoringConfig(max_range=audit.config.max_range, zbuffer_size=_FINE_BUFFER)
     frames = worst_frames(audit, count)
     pictures: list[tuple[np.ndarray, np.ndarray]] = []
@@ -227,7 +225,7 @@ def worst_figure(audit: Audit, count: int = 4) -> Figure:
 def _pictures(
     state: MapState, audit: Audit, pose: np.ndarray, config: ScoringConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Renders mean colors [h, w, 3] and renderability [h, w] (else NaN) of a view of a map."""
+    """Renders mean colors [h, w, 3] and renderability [h, w] (NaN elsewhere) of a view of a map."""
     seen = term_images(state, audit.camera, jnp.asarray(pose, dtype=jnp.float32), config)
     row = np.asarray(seen.row)
     is_hit = row < state.capacity
@@ -242,14 +240,14 @@ def _short(name: str) -> str:
 
 
 _TRIED = 6
-"""Images of which the depth is looked at."""
+"""Maximum number of images whose depth is checked."""
 
 _SLACK = 0.5
-"""A region this far behind or before the depth of its pixel is not what the image shows there
-[audit units]."""
+"""Tolerance between a region's depth and the image's depth at its pixel: beyond it the image shows
+something else there [audit units]."""
 
 _BEST_DISTANCE = 2.0
-"""From here a region is in the image with what is around it [audit units]."""
+"""Distance from which an image shows a region with its surroundings [audit units]."""
 
 _PER_LINE = 5
 
@@ -259,23 +257,22 @@ class _Shown:
     """An image that shows a region."""
 
     index: int
-    """Number of the image in the capture."""
+    """Index of the image in the capture."""
 
     column: float
-    """Column of the region's middle in the thinned image [px]."""
+    """Column of the region's center in the thinned image [px]."""
 
     row: float
-    """Row of the region's middle in the thinned image [px]."""
+    """Row of the region's center in the thinned image [px]."""
 
     radius: float
     """Radius of the region [px]."""
 
 
 def best_picture(audit: Audit, region: Region) -> _Shown | None:
-    """Finds the image with the region near its middle, at a good distance, and not hidden.
+    """Finds the image with the region near its center, at a good distance, and not occluded.
 
-    Only depth images can show that a region is hidden. Returns None if no image has the region's
-    middle in it.
+    Only depth images can show occlusion. Returns None if no image contains the region's center.
     """
     poses = audit.survey.alignment.poses(audit.source.poses[audit.survey.chosen])
     found: list[tuple[float, float, _Shown]] = []
@@ -296,7 +293,7 @@ def best_picture(audit: Audit, region: Region) -> _Shown | None:
 
 
 def _shows(audit: Audit, finding: _Shown, z: float) -> bool:
-    """Returns False if the depth image measures something else there."""
+    """Returns False if the depth image measures another surface there."""
     if not audit.source.is_dense:
         return True
     depth = audit.source.read(finding.index)[1][int(finding.row), int(finding.column)]
@@ -304,7 +301,7 @@ def _shows(audit: Audit, finding: _Shown, z: float) -> bool:
 
 
 def region_figure(audit: Audit) -> Figure | None:
-    """Draws the worst regions in images of the capture; returns None if no image shows any."""
+    """Draws the worst regions in images of the capture; returns None if no image shows one."""
     shown = [
         (number, region, finding)
         for number, region in enumerate(audit.regions)

@@ -1,4 +1,4 @@
-"""The report of an audit: one HTML page that opens from disk, with everything inside."""
+"""Writes the report of an audit: one self-contained HTML page that opens from disk."""
 
 import shlex
 from collections.abc import Iterable
@@ -24,13 +24,13 @@ from r3jax.plots.pictures import small_png
 from r3jax.plots.style import to_png
 
 _SHOWN = 8
-"""Pictures of a finding that are shown."""
+"""Maximum number of pictures shown for a finding."""
 
 _SIDE = 230
 """Longer side of a picture on the page [px]."""
 
 _BAR = 90
-"""Width of the bar of a cause that takes everything [px]."""
+"""Width of the bar of a cause with a share of 100 % [px]."""
 
 
 def write_report(
@@ -44,17 +44,17 @@ def write_report(
     """Writes `report.html`.
 
     Args:
-        audit: what was found.
-        folder: a folder that exists.
-        files: what lies beside the page, to be named on it.
-        capture: what was audited, for commands that the page names.
-        preview: a splat of the capture, if one was trained.
+        audit: the result.
+        folder: an existing folder.
+        files: names of the files beside the page, which it lists.
+        capture: path of the audited capture, for the commands that the page shows.
+        preview: images of a splat of the capture, if one was trained.
 
     Returns:
-        The page; its images are inside it, so that it can be sent as one file.
+        Path of the page; its images are embedded, so that it can be sent as one file.
 
     Raises:
-        OSError: the disk is full, not writable, ...
+        OSError: for example, the disk is full or not writable.
     """
     region_figure = audit_figures.region_figure(audit)
     is_ranked = not audit.is_saturated
@@ -99,7 +99,7 @@ def write_report(
 
 
 def _gain(audit: Audit) -> bytes | None:
-    """Draws the promise; without a depth camera there is none."""
+    """Draws the expected gain, or returns None without a depth camera."""
     is_promised = audit.plan.views and audit.source.is_complete
     return to_png(audit_figures.gain_figure(audit)) if is_promised else None
 
@@ -130,8 +130,8 @@ def _cards(audit: Audit) -> dict[str, str]:
 def picture_faults(audit: Audit) -> dict[str, Any]:
     """Returns findings, remarks and notes about single pictures.
 
-    A remark takes the place of findings where there are none, or says that the poses contradict
-    each other.
+    If there are no findings, a remark takes their place. A remark also reports that the poses
+    contradict each other.
     """
     faults = audit.faults
     findings = [_finding(audit, finding) for finding in faults.findings]
@@ -157,9 +157,9 @@ def picture_faults(audit: Audit) -> dict[str, Any]:
 
 
 def _nothing_found(audit: Audit) -> str:
-    """Describes the faults that were looked for and not found.
+    """Describes the faults that were searched for and not found.
 
-    Only what could be measured is mentioned.
+    Only faults that could be measured are mentioned.
     """
     record = audit.faults.record
     known = lambda name: any(value is not None for value in record.get(name, []))
@@ -167,12 +167,13 @@ def _nothing_found(audit: Audit) -> str:
         word for word, name in (("sharp", "detail"), ("evenly lit", "brightness")) if known(name)
     ]
     if audit.source.is_complete and known("pose_off_by"):
-        good.append("where they say")
+        good.append("consistent with their poses")
     if not audit.source.has_images:
-        return "None of them is there" + (", the depth images are where they say." if good else ".")
+        poses = ", but the depth images are consistent with their poses." if good else "."
+        return "The pictures are missing" + poses
     if not good:
-        return "Nothing can be said of them."
-    return f"Nothing was found: as far as they can be compared, they are {sentences.listed(good)}."
+        return "The pictures could not be compared."
+    return f"No problems found: as far as they can be compared, they are {sentences.listed(good)}."
 
 
 def _finding(audit: Audit, finding: Finding) -> dict[str, Any]:
@@ -198,7 +199,7 @@ def _thumbnail(audit: Audit, index: int) -> bytes:
 
 
 def _reconstruction(audit: Audit) -> list[dict[str, str]]:
-    """Lists the field's own numbers of a structure from motion, and what is usual."""
+    """Lists the standard quality measures of structure from motion, with their usual values."""
     found = audit.source.reconstruction
     if found is None:
         return []
@@ -224,7 +225,7 @@ def _causes(audit: Audit) -> list[dict[str, Any]]:
     for cause, meaning in sentences.MEANING.items():
         if cause == NOT_KNOWN and is_complete:
             continue
-        is_edge = cause == "unseen"  # where free space ends, which has an area only
+        is_edge = cause == "unseen"  # the edge of free space, which has an area but no share
         if is_edge and not audit.unseen:
             continue
         share = None if is_edge else sentences.cause_share(audit, cause)
@@ -246,7 +247,7 @@ def _causes(audit: Audit) -> list[dict[str, Any]]:
 
 
 def _regions(audit: Audit) -> list[dict[str, Any]]:
-    """Returns a table row for each bad region, and for each place where the capture ends."""
+    """Returns a table row for each bad region and for each unseen place."""
     rows: list[dict[str, Any]] = []
     for number, region in enumerate(audit.all_regions):
         center = audit.survey.alignment.points_back(region.center[None])[0]

@@ -1,4 +1,4 @@
-"""The places with the largest deficit: blocks of voxels that render badly, the worst first.
+"""Finds the places with the largest deficit: blocks of voxels that render badly, the worst first.
 
 Shape symbols: N rows of the map; m bad voxels; X Y Z cells of the coarse grid.
 """
@@ -19,13 +19,13 @@ from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.renderability import term_images
 
 BLOCK = 1.0
-"""Regions are as large, and their middles as far apart [audit units]."""
+"""Size of a region, and minimum distance between the centers of two [audit units]."""
 
 MOST = 10
-"""Bad regions that are listed."""
+"""Maximum number of bad regions listed."""
 
 MOST_UNSEEN = 6
-"""Unseen regions that are listed."""
+"""Maximum number of unseen regions listed."""
 
 _SMALLEST = 0.02
 """Smaller regions are not reported [square audit units]."""
@@ -38,23 +38,23 @@ class Region:
     """One bad place."""
 
     center: np.ndarray
-    """Middle of its bad voxels or cells, [3] [audit units]."""
+    """Center of its bad voxels or cells, [3] [audit units]."""
 
     area: float
-    """Area of its bad voxels or cells, a face each [square audit units]."""
+    """Area of its bad voxels or cells, counting one face of each [square audit units]."""
 
     cause: str
-    """What most of its bad voxels suffer from; `unseen` or `not_known` where there are none yet."""
+    """Most frequent cause among its bad voxels; `unseen` or `not_known` if it has no voxels yet."""
 
     renderability: float
     """Mean over its bad voxels; 0 where nothing is known."""
 
     bad_share: float
-    """Bad voxels among those of the block that can be seen; 1 where nothing is known."""
+    """Share of bad voxels among the visible voxels of the block; 1 where nothing is known."""
 
     rows: np.ndarray
-    """Rows of its bad voxels in the map; of `unseen` flat indices of its cells; of `not_known`
-    none."""
+    """Rows of its bad voxels in the map; for `unseen`, flat indices of its cells; for `not_known`,
+    empty."""
 
     @property
     def is_known(self) -> bool:
@@ -63,15 +63,15 @@ class Region:
 
 
 def bad_regions(state: MapState, diagnosis: Diagnosis, most: int = MOST) -> list[Region]:
-    """Finds the known surfaces that would render badly, the largest loss first.
+    """Finds the known surfaces that would render badly, the largest deficit first.
 
     The loss of a block is the sum of 1 - R over its bad voxels. A region is what lies within half
     a block of the bad voxel in the middle of the worst block that is left.
 
     Args:
         state: the map.
-        diagnosis: of its voxels.
-        most: regions at most.
+        diagnosis: diagnosis of its voxels.
+        most: maximum number of regions.
     """
     centers = np.asarray(state.center, np.float64).T
     face = float(state.voxel_size) ** 2
@@ -95,18 +95,18 @@ def bad_regions(state: MapState, diagnosis: Diagnosis, most: int = MOST) -> list
             )
             found.append(region)
         left &= ~is_near
-    # A region is not quite the block that it was found by.
+    # A region differs slightly from the block in which it was found.
     return sorted(found, key=lambda region: -float((1.0 - diagnosis.value[region.rows]).sum()))
 
 
 def _worst_block(points: np.ndarray, loss: np.ndarray) -> np.ndarray:
-    """Finds the middle point in the block of a regular division that loses most, [3]."""
+    """Returns the central point of the grid block with the largest total deficit, [3]."""
     index = np.floor(points / BLOCK).astype(np.int64)
     _, block = np.unique(index, axis=0, return_inverse=True)
     block = block.reshape(-1)
     worst = int(np.argmax(np.bincount(block, weights=loss)))
     inside = points[block == worst]
-    # One of the points, so that there is something near it.
+    # Choose one of the points, so that the center lies on a surface.
     return inside[np.argmin(np.linalg.norm(inside - inside.mean(axis=0), axis=1))]
 
 
@@ -115,7 +115,7 @@ def unseen_edges(grid: OccupancyGrid, open_cells: np.ndarray) -> np.ndarray:
 
     Args:
         grid: free and occupied space.
-        open_cells: unexplored cells that count, [X, Y, Z] bool: not the inside of walls.
+        open_cells: unexplored cells to consider, [X, Y, Z] bool; excludes the inside of walls.
     """
     return open_cells & ndimage.binary_dilation(np.asarray(grid.free), _FACES)
 
@@ -125,8 +125,8 @@ def unseen_regions(grid: OccupancyGrid, edges: np.ndarray, most: int = MOST_UNSE
 
     Args:
         grid: free and occupied space.
-        edges: such cells, [X, Y, Z] bool.
-        most: regions at most.
+        edges: unseen cells beside free space, [X, Y, Z] bool.
+        most: maximum number of regions.
     """
     cell = float(grid.cell_size)
     points = centers_on_host(grid, np.argwhere(edges))
@@ -145,15 +145,15 @@ def unseen_regions(grid: OccupancyGrid, edges: np.ndarray, most: int = MOST_UNSE
 def blank_points(
     state: MapState, known: np.ndarray, camera: Camera, pose: np.ndarray, config: ScoringConfig
 ) -> np.ndarray:
-    """Estimates the points that pixels without a known surface look at, [k, 3] [audit units].
+    """Estimates the points seen by pixels without a known surface, [k, 3] [audit units].
 
-    Their depth is that of the nearest pixel with a known surface: a guess, good for a wall between
-    its edges. An image without any known surface gives no points.
+    Their depth is copied from the nearest pixel with a known surface. This is an estimate that
+    works for a wall between its edges. An image without any known surface yields no points.
 
     Args:
         state: the map of all images.
         known: rows that are known surfaces, [N].
-        camera: of the image.
+        camera: camera of the image.
         pose: `T_world_camera`, [4, 4] [audit units].
         config: range and size of the depth buffer.
     """
@@ -181,9 +181,9 @@ def blank_regions(
     """Finds places that images show but where no surface is known, the largest first.
 
     Args:
-        state: the map of all images; of it, the voxels' size.
+        state: the map of all images, which provides the voxel size.
         points: `blank_points` of every image.
-        most: regions at most.
+        most: maximum number of regions.
     """
     size = float(state.voxel_size)
     voxels = [np.unique(np.floor(part / size).astype(np.int64), axis=0) for part in points]
@@ -192,7 +192,7 @@ def blank_regions(
     found, count = np.unique(np.concatenate(voxels), axis=0, return_counts=True)
     taken = np.floor(np.asarray(state.center).T[np.asarray(state.present)] / size).astype(np.int64)
     blank = (found[count >= FEWEST_PICTURES] + 0.5) * size
-    if len(taken) and len(blank):  # beside a surface that is known it is known well enough
+    if len(taken) and len(blank):  # points beside a known surface do not count as unknown
         distance, _ = KDTree((taken + 0.5) * size).query(blank)
         blank = blank[np.asarray(distance) > 1.5 * size]
     left = np.ones(len(blank), dtype=bool)

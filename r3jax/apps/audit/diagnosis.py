@@ -1,8 +1,9 @@
-"""How well every surface would render for somebody who stands somewhere else, and why not better.
+"""Diagnoses how well every surface would render from other places, and what limits its quality.
 
-Renderability belongs to a voxel *and* a place from which it is asked. The places here are spread
-over all where somebody could stand (`captures.standpoints`), to take an image or to look at the
-result; of each voxel the answers of those that see it are averaged.
+Renderability depends on a voxel *and* on the position from which it is viewed. The standpoints used
+here are spread over all places where a person could stand (`captures.standpoints`), to take a
+picture or to view the result. The scores of each voxel are averaged over the standpoints that see
+it.
 
 Shape symbols: N rows of the map; p standpoints.
 """
@@ -30,16 +31,16 @@ TERMS = ("bias", "noise", "resolution")
 """Factors of renderability, in the paper's order."""
 
 LEAST = 1e-3
-"""Terms are not counted lower, so that their logarithm stays finite."""
+"""Lower bound of a term, so that its logarithm stays finite."""
 
 
 @dataclass(frozen=True)
 class ViewScore:
-    """How well one view would render, and why not better."""
+    """Predicted render quality of one view, and what limits it."""
 
     renderability: float
-    """Mean over all pixels; a pixel without a voxel counts 0. Where surfaces may be not known, mean
-    over the pixels that show a known one; NaN where there is none."""
+    """Mean over all pixels, where a pixel without a voxel counts 0. If surfaces may be unknown, the
+    mean over the pixels that show a known one; NaN if there are none."""
 
     coverage: float
     """Share of the pixels that show a known voxel."""
@@ -54,30 +55,31 @@ class ViewScore:
     """Mean over the pixels that show a voxel."""
 
     cause: str
-    """What costs most: `unseen` (pixels without a voxel), `angle`, `noise` or `distance`;
-    `not_known` where no pixel shows a known surface."""
+    """Main cause of the deficit: `unseen` (pixels without a voxel), `angle`, `noise` or `distance`;
+    `not_known` if no pixel shows a known surface."""
 
     shares: dict[str, float]
-    """Share of all pixels of each of `CAUSES`, and `unseen` or `not_known`; they sum to 1."""
+    """Share of all pixels with each of `CAUSES`, and `unseen` or `not_known`; they sum to 1."""
 
 
 CAUSE_OF_TERM = {"bias": "angle", "noise": "noise", "resolution": "distance"}
-"""What a low factor means."""
+"""Cause that a low factor stands for."""
 
 
 NOT_KNOWN = "not_known"
 """Cause of pixels without a known surface, in captures without a depth camera."""
 
 FEWEST_PICTURES = 2
-"""A voxel that fewer pictures have measured is not known, where depth is inferred from pictures."""
+"""Minimum number of pictures that must measure a voxel for it to count as known, if depth is
+inferred from pictures."""
 
 
 def known_rows(state: MapState, is_complete: bool) -> np.ndarray:
-    """Returns a mask of the rows of the map of all images that are known surfaces, [N].
+    """Returns a mask of the map's rows that are known surfaces, [N].
 
     Args:
-        state: the map.
-        is_complete: True if a depth camera measured it: then all are.
+        state: the map of all images.
+        is_complete: True if a depth camera measured it: then all rows are known.
     """
     return np.asarray(state.count) >= (1 if is_complete else FEWEST_PICTURES)
 
@@ -93,11 +95,11 @@ def view_score(
 
     Args:
         state: the map.
-        camera: of the view; its focal length in the unit that the map was made with.
+        camera: camera of the view, with its focal length in the unit used for the map.
         pose: `T_world_camera`, [4, 4] [audit units].
         config: range and size of the depth buffer.
-        known: rows that are known surfaces, [N]: pixels without one are not known. None: all are,
-            and pixels without a voxel show what was never seen.
+        known: mask of known surfaces, [N]: pixels without one are not known. None if all rows are
+            known; pixels without a voxel are then unseen.
     """
     seen = term_images(state, camera, jnp.asarray(pose, dtype=jnp.float32), config)
     row, value = np.asarray(seen.row), np.asarray(seen.value)
@@ -107,7 +109,7 @@ def view_score(
     coverage = float(is_hit.mean())
     images = {name: np.asarray(getattr(seen, name))[is_hit] for name in TERMS}
     mean = {name: float(x.mean()) if x.size else 0.0 for name, x in images.items()}
-    # log R = sum of the logarithms: what each term costs adds up over the pixels that show any.
+    # log R is the sum of the terms' logarithms, so the cost of each term adds up over the pixels.
     costs = -np.log(np.maximum(np.stack([images[name] for name in TERMS]), LEAST))
     cost = {
         CAUSE_OF_TERM[name]: float(x.sum()) / is_hit.size
@@ -137,17 +139,17 @@ def view_score(
 
 
 CAUSES = ("fine", "angle", "rare", "distance", "noise")
-"""What a voxel suffers from most; the numbers in `Diagnosis.cause` count along these."""
+"""Main causes of a voxel's deficit; `Diagnosis.cause` contains indices into this."""
 
 FINE = 0.5
 """A voxel whose mean renderability is at least this counts as fine."""
 
 FEW = 3
-"""A voxel that was measured in fewer images was seen too rarely."""
+"""A voxel measured in fewer images counts as seen too rarely."""
 
 
 class Demand(eqx.Module):
-    """From where surfaces will be looked at. Surfaces do not move, so it is made once."""
+    """Standpoints from which surfaces will be viewed. Computed once, as surfaces do not move."""
 
     position: Float[Array, "p 3"]
     """The standpoints [audit units]."""
@@ -162,24 +164,24 @@ class Demand(eqx.Module):
 
 
 class StandpointScores(eqx.Module):
-    """What the standpoints say of the voxels."""
+    """Scores of the voxels from the standpoints."""
 
     value: Float[Array, "p N"]
-    """Renderability of each voxel from each standpoint; 0 where it does not see it."""
+    """Renderability of each voxel from each standpoint; 0 where the standpoint does not see it."""
 
     terms: Float[Array, "3 N"]
     """Sums of bias, noise and resolution over the standpoints that see a voxel."""
 
     costs: Float[Array, "3 N"]
-    """Sums of -log of the same."""
+    """Sums of -log of the same terms."""
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What is wrong with each voxel. Means are over the standpoints that see it."""
+    """Quality and main deficit of each voxel. Means are over the standpoints that see it."""
 
     num_seen: np.ndarray
-    """Standpoints that see the voxel, [N]; where there is none the rest is 0."""
+    """Number of standpoints that see the voxel, [N]; if 0, the other fields are 0."""
 
     value: np.ndarray
     """Mean renderability, [N]."""
@@ -194,7 +196,7 @@ class Diagnosis:
     """Mean factor of the distance, [N]."""
 
     num_directions: np.ndarray
-    """Direction bins that have seen the voxel, [N]."""
+    """Number of direction bins from which the voxel was seen, [N]."""
 
     cause: np.ndarray
     """Index into `CAUSES`, [N] int."""
@@ -206,17 +208,17 @@ class Diagnosis:
 
     @property
     def mean(self) -> float:
-        """Mean renderability of the surfaces that can be seen; 0 where there are none."""
+        """Mean renderability of the visible surfaces; 0 if there are none."""
         return float(self.value[self.is_seen].mean()) if self.is_seen.any() else 0.0
 
     @property
     def fine_share(self) -> float:
-        """Share of the surfaces that can be seen, of those that are fine."""
+        """Share of the visible surfaces that are fine."""
         evaluated = self.is_seen
         return float((self.value[evaluated] >= FINE).mean()) if evaluated.any() else 0.0
 
     def share(self, cause: str) -> float:
-        """Returns the share of this cause among the surfaces that can be seen, in [0, 1]."""
+        """Returns the share of a cause among the visible surfaces, in [0, 1]."""
         evaluated = self.is_seen
         wanted = self.cause[evaluated] == CAUSES.index(cause)
         return float(wanted.mean()) if evaluated.any() else 0.0
@@ -252,10 +254,10 @@ def score_from_standpoints(
     Args:
         state: the map; its surfaces are those of the demand.
         demand: the standpoints, and the voxels that each sees.
-        focal: focal length of the camera that would render [px], in the map's unit.
-        config: of the closed forms.
+        focal: focal length of the rendering camera [px], in the map's unit.
+        config: settings of the closed forms.
     """
-    # Numbers of the standpoints, as floats: `map_over_devices` distributes floats.
+    # Indices of the standpoints as floats, because `map_over_devices` distributes floats.
     ids = jnp.arange(demand.position.shape[0], dtype=jnp.float32)
     part = functools.partial(_answers, state, demand, focal, config)
     value, terms, costs = map_over_devices(part, ids)
@@ -299,11 +301,11 @@ def _answers(
 
 
 def diagnose(state: MapState, demand: Demand, answers: StandpointScores) -> Diagnosis:
-    """Evaluates every voxel by the mean of the answers.
+    """Evaluates every voxel by its mean score over the standpoints.
 
     Args:
         state: the map.
-        demand: who was asked.
+        demand: the standpoints.
         answers: their scores of this map.
     """
     count = np.asarray(demand.num_seen)

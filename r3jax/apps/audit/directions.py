@@ -16,53 +16,54 @@ from r3jax.kernels.robot.cells import segments_are_inside
 from r3jax.mapping.occupancy import OccupancyGrid
 
 _STEP = 0.1
-"""A person follows steps of this, and no finer [m]."""
+"""Resolution of the steps in directions: a person cannot follow finer ones [m]."""
 
 _TURN = 10.0
 """The same for turns [deg]."""
 
 _SAME_PLACE = 0.3
-"""Pictures so much farther away than the nearest one are as near to a person [audit units]."""
+"""Pictures up to this much farther away than the nearest one count as equally near
+[audit units]."""
 
 _ROUND = 10.0
-"""A straight line that something blocks counts as so much longer [audit units]."""
+"""Length added to a straight line that is blocked [audit units]."""
 
 _SHOWS = 0.3
-"""An image that shows less of a view than this share does not help to find it."""
+"""Minimum share of a view that an image must show to help find the view."""
 
 _SAMPLED = 500
-"""Voxels of a view that are looked for in other images."""
+"""Maximum number of voxels of a view that are searched for in other images."""
 
 _NEAREST = 0.1
-"""What is nearer to a camera is not in its image [audit units]."""
+"""Near plane: points closer to a camera are not in its image [audit units]."""
 
 
 @dataclass(frozen=True)
 class Way:
-    """How to get to a view from where a picture was taken."""
+    """Directions to a view from the place where a picture was taken."""
 
     start: int
-    """The picture, in the capture's numbering."""
+    """Index of this picture in the capture."""
 
     text: str
-    """What to do, one sentence."""
+    """The directions, one sentence."""
 
     turn: float
     """Angle to turn by, positive to the left [deg]."""
 
     is_blocked: bool
-    """True if something stands between the picture's place and the view's."""
+    """True if an obstacle stands between the picture's place and the view's."""
 
     target: int | None
-    """A picture that shows much of what the view shows; None: there is none."""
+    """Index of a picture that shows much of what the view shows; None if there is none."""
 
 
 def spoken_length(length: float, unit: str) -> str:
-    """Writes a length as one says it: 40 cm, 1.2 m; of an unknown unit to two digits.
+    """Writes a length as it is spoken: 40 cm, 1.2 m; two digits if the unit is unknown.
 
     Args:
-        length: in the capture's unit.
-        unit: `m`, or another name of an unknown one.
+        length: length in the capture's unit.
+        unit: `m`, or the name of an unknown unit.
     """
     if unit != "m":
         return f"{length:.2g} {unit}"
@@ -71,7 +72,7 @@ def spoken_length(length: float, unit: str) -> str:
 
 
 Order = Literal["forward", "aside", "straight"]
-"""How one goes: forward or back first, to the side first, or straight."""
+"""Order of the steps: forward or back first, to the side first, or straight to the place."""
 
 
 def steps_between(
@@ -81,22 +82,22 @@ def steps_between(
     unit: str = "m",
     order: Order = "forward",
 ) -> list[str]:
-    """Says how to get from one view to another: go, hold higher, turn, look up.
+    """Describes the steps from one view to another: walk, raise or lower the camera, turn, tilt.
 
-    Forward and left are those of the view where one is, in the plane; a view that looks straight up
-    or down is faced as its upper edge.
+    Forward and left refer to the horizontal heading of the current view. A view that looks straight
+    up or down has the heading of the upper edge of its image.
 
     Args:
         here: `T_world_camera`, [4, 4], z up.
-        there: the same, of the view to take.
-        meter: one of the capture's units in the poses' units.
-        unit: its name.
-        order: how one goes.
+        there: pose of the view to take, in the same form.
+        meter: length of one capture unit in the units of the poses.
+        unit: name of the capture unit.
+        order: order of the steps.
     """
     forward = _ahead(here)
     left = np.array([-forward[1], forward[0]])
     offset = (there[:3, 3] - here[:3, 3]) / meter
-    # In a capture without meters nothing says what a step is.
+    # Without a metric scale the length of a step is unknown.
     least = max(0.5 * _STEP if unit == "m" else 0.0, 1e-6)
     moves = [
         f"{spoken_length(abs(amount), unit)} {forth if amount > 0 else back}"
@@ -128,14 +129,14 @@ def steps_between(
 
 
 def turn_between(here: np.ndarray, there: np.ndarray) -> float:
-    """Computes the angle in the plane between two views' axes, positive to the left [deg]."""
+    """Computes the horizontal angle between two views' axes, positive to the left [deg]."""
     forward, ahead = _ahead(here), _ahead(there)
     across = forward[0] * ahead[1] - forward[1] * ahead[0]
     return float(np.degrees(np.arctan2(across, forward @ ahead)))
 
 
 def _ahead(pose: np.ndarray) -> np.ndarray:
-    """Returns the axis of a view in the plane, [2]; if it looks up or down, its upper edge."""
+    """Returns the heading of a view, [2]: its axis, or its upper edge if it looks up or down."""
     axis = pose[:3, 2] if np.hypot(*pose[:2, 2]) > 0.05 else -pose[:3, 1]
     return axis[:2] / np.hypot(*axis[:2])
 
@@ -160,7 +161,7 @@ def _turn_words(turn: float) -> str:
 
 
 def _face_words(turn: float) -> str:
-    """Says where to turn after going straight: one faces another way by then than the picture."""
+    """Says where to turn after a straight walk, which changes the heading of the person."""
     if abs(turn) < 0.5 * _TURN:
         return f"face {_THERE}"
     return f"face {_rounded(turn):.0f}° to the {'left' if turn > 0 else 'right'} of {_THERE}"
@@ -170,13 +171,13 @@ _THERE = "where that picture looks"
 
 
 def way_to(source: Source, survey: Survey, seen: Seen, view: Suggestion) -> Way:
-    """Describes the way to a view, from the nearest picture that nothing stands before.
+    """Describes the way to a view, from the nearest picture with an unobstructed line to it.
 
     Args:
         source: the capture.
-        survey: which pictures were used, and where the audit has them.
+        survey: the pictures used, and their poses in the audit.
         seen: free and occupied space.
-        view: to be taken.
+        view: the view to take.
     """
     poses = survey.alignment.poses(source.poses[survey.chosen])
     nearest, is_blocked = _nearest(poses, seen, view)
@@ -202,13 +203,13 @@ def way_to(source: Source, survey: Survey, seen: Seen, view: Suggestion) -> Way:
 
 
 def _reach(feet: np.ndarray, pose: np.ndarray, meter: float, unit: str) -> str:
-    """Describes a camera that is held over something."""
+    """Describes how far to hold the camera out over an obstacle."""
     out = float(np.linalg.norm(pose[:2, 3] - feet[:2, 3])) / meter
     return f"hold the camera {spoken_length(out, unit)} out over what stands there"
 
 
 def _order(here: np.ndarray, there: np.ndarray, grid: OccupancyGrid) -> Order:
-    """Chooses an order of steps in which nothing is in the camera's way, if there is one."""
+    """Chooses an order of steps along which the camera meets no obstacle, if there is one."""
     forward, start = _ahead(here), here[:3, 3]
     offset = there[:3, 3] - start
     ahead = np.array([*(offset[:2] @ forward * forward), 0.0])
@@ -222,7 +223,7 @@ def _order(here: np.ndarray, there: np.ndarray, grid: OccupancyGrid) -> Order:
 
 
 def _is_blocked(grid: OccupancyGrid, start: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Finds which straight lines from a place [3] to others [n, 3] meet something, [n] bool."""
+    """Finds which straight lines from a place [3] to others [n, 3] meet an obstacle, [n] bool."""
     origin, cell = np.asarray(grid.origin, np.float64), float(grid.cell_size)
     clear = ~np.asarray(grid.occupied)
     return ~segments_are_inside(clear, (start - origin) / cell, (ends - origin) / cell)
@@ -244,8 +245,8 @@ def _likest_picture(
 ) -> tuple[int, float]:
     """Finds the image with most of what a view shows, and the share of it [0, 1].
 
-    What hides it is not asked. A radian between the two axes and a unit between the two places
-    cost a tenth of the view each.
+    Occlusion is ignored. Each radian between the two axes, and each unit of distance between the
+    two places, costs a tenth of the share.
     """
     poses = survey.alignment.poses(source.poses[survey.chosen])
     distance = np.linalg.norm(poses[:, :3, 3] - view.pose[:3, 3], axis=1)

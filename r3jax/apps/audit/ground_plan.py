@@ -1,6 +1,6 @@
-"""The capture from above: what is there, how well it would render, and where to go next.
+"""Draws the capture from above: surfaces, their renderability, and where to go next.
 
-Its colors and letters are those of the point clouds and of all figures.
+Colors and letters are the same as in the point clouds and all other figures.
 """
 
 import numpy as np
@@ -56,19 +56,19 @@ Extent = tuple[float, float, float, float]
 """Left, right, bottom and top of a picture."""
 
 _HEADROOM = 0.35
-"""As in `floor_picture`: what lies higher above the cameras is left out [audit units]."""
+"""As in `floor_picture`: anything higher than this above the cameras is left out [audit units]."""
 
 _WEDGE = 0.45
 """Length of a suggested view's field of view [audit units]."""
 
 _TOO_NEAR = 0.35
-"""Letters nearer to each other than this would cover each other [audit units]."""
+"""Minimum distance between letters, so that they do not overlap [audit units]."""
 
 _WIDTH = 4.2
-"""Width of a map [inch]: its letters can be read on a phone."""
+"""Width of a map [inch]; small enough for its letters to be legible on a phone."""
 
 LETTERED, _DARK = 5, 3
-"""Regions, and places where the capture ends, that the plan names: more letters hide it."""
+"""Maximum numbers of bad regions and of unseen places labeled on the plan, to keep it readable."""
 
 _MARKER = 0.3
 """Width of a numbered marker [inch]."""
@@ -76,12 +76,12 @@ _MARKER = 0.3
 _PUSHES = 200
 
 _MOST_PIXELS = 2000
-"""Pixels along a side of the picture of renderability: in larger places voxels share them."""
+"""Maximum side of the image of renderability [px]; in larger places voxels share pixels."""
 
 _HALO = withStroke(linewidth=2.0, foreground="white")
 
 _PALE = 0.55
-"""How much white covers the colors below marks."""
+"""Opacity of the white layer between the colors and the marks."""
 
 
 def plan_figure(audit: Audit) -> Figure:
@@ -92,7 +92,7 @@ def plan_figure(audit: Audit) -> Figure:
     unit = 1.0 / audit.survey.alignment.scale
     pale = _PALE + (1.0 - _PALE) * picture
     axes.imshow(pale, origin="lower", extent=_scaled(extent, unit), interpolation="nearest")
-    # Coordinates are in the tables: a person needs to see how far it is.
+    # Coordinates are in the tables; here a person only needs a scale.
     axes.set_xticks([])
     axes.set_yticks([])
     axes.set_xlabel("")
@@ -129,7 +129,7 @@ def _height(audit: Audit) -> float:
 
 
 def _map(audit: Audit, height: float) -> tuple[Figure, Axes, np.ndarray]:
-    """Makes an empty map of the place; returns also its size [2] [audit units]."""
+    """Creates an empty map of the place; also returns its size [2] [audit units]."""
     low, high = _used(audit, height)
     size = high - low
     figure = style.new_figure(_WIDTH, float(np.clip(_WIDTH * size[1] / size[0] + 0.5, 3.0, 11.0)))
@@ -183,7 +183,7 @@ def _below(audit: Audit, height: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _value_picture(audit: Audit, height: float) -> tuple[np.ndarray, Extent]:
-    """Averages renderability over columns of voxels, [x, y], else NaN; returns also its extent."""
+    """Averages renderability over columns of voxels, [x, y], NaN if empty; also returns extents."""
     centers, values = _below(audit, height)
     low, high = np.percentile(centers[:, :2], [0.2, 99.8], axis=0)
     size = max(audit.survey.voxel_size, float((high - low).max()) / _MOST_PIXELS)
@@ -201,7 +201,7 @@ def _value_picture(audit: Audit, height: float) -> tuple[np.ndarray, Extent]:
 
 
 def _draw_scale(axes: Axes, audit: Audit) -> None:
-    """Draws a bar as long as a unit of the capture, or a round number of them."""
+    """Draws a scale bar, one unit of the capture long or a round multiple."""
     left, right = axes.get_xlim()
     bottom, top = axes.get_ylim()
     length = 10.0 ** np.floor(np.log10(max(right - left, 1e-9) / 2.0))
@@ -214,7 +214,7 @@ def _draw_scale(axes: Axes, audit: Audit) -> None:
 
 
 def _draw_path(axes: Axes, audit: Audit, unit: float) -> None:
-    """Draws the evaluated frames: a line in their order, a dot each, colored by renderability."""
+    """Draws the evaluated frames as a line with a dot for each, colored by renderability."""
     places = unit * np.stack([frame.pose[:2, 3] for frame in audit.frames])
     ahead = np.stack([frame.pose[:2, 2] for frame in audit.frames])
     axes.plot(*places.T, color=style.INK, linewidth=0.8, alpha=0.35, zorder=2)
@@ -260,7 +260,7 @@ def _draw_regions(axes: Axes, audit: Audit, unit: float) -> None:
 
 
 def _labels(regions: list[tuple[int, Region]]) -> list[tuple[np.ndarray, str, str]]:
-    """Chooses place, text and color of each label: regions above each other share one."""
+    """Chooses position, text and color of each label; regions above each other share one."""
     places: list[tuple[np.ndarray, str, str]] = []
     for number, region in regions:
         center = region.center[:2]
@@ -274,9 +274,9 @@ def _labels(regions: list[tuple[int, Region]]) -> list[tuple[np.ndarray, str, st
 
 
 def apart(places: np.ndarray, least: float) -> np.ndarray:
-    """Places [n, 2] moved as little as it takes for each two to be `least` apart, about.
+    """Moves places [n, 2] as little as needed so that any two are about `least` apart.
 
-    Pairs that are too near push each other away, again and again; two on one spot part sideways.
+    Pairs that are too close repel each other, iteratively; coincident ones separate sideways.
     """
     moved = np.array(places, dtype=np.float64)
     for _ in range(_PUSHES):
@@ -304,7 +304,7 @@ def _draw_views(axes: Axes, audit: Audit, unit: float, least: float) -> None:
         eye, ahead = view.pose[:2, 3], view.pose[:2, 2]
         azimuth, level = np.arctan2(ahead[1], ahead[0]), float(np.linalg.norm(ahead))
         angles = azimuth + np.linspace(-half, half, 9)
-        reach = _WEDGE * max(level, 0.35)  # short where it looks up or down
+        reach = _WEDGE * max(level, 0.35)  # shorter if the view looks up or down
         rim = eye + reach * np.stack([np.cos(angles), np.sin(angles)], axis=1)
         corners = unit * np.concatenate([eye[None], rim])
         axes.add_patch(

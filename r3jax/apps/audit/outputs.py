@@ -1,10 +1,10 @@
-"""What an audit leaves on disk beside its report, in the capture's own coordinates.
+"""Writes the files of an audit beside its report, in the capture's own coordinates.
 
 voxels.ply                 voxels, colored by renderability from red to green
-causes.ply                 voxels, colored by what they suffer from; the terms as properties
+causes.ply                 voxels, colored by cause of low quality; the terms as properties
 suggested.json             the suggested views as nerfstudio's camera_path.json
 suggested_transforms.json  the same as a transforms.json
-audit.json                 every number; `alignment` takes the capture to z up, a meter to the unit
+audit.json                 every number; `alignment` maps the capture to z up and units of a meter
 preview.ply                a splat, in these coordinates (`--preview`)
 """
 
@@ -35,25 +35,25 @@ FORMAT = 1
 """Version of audit.json."""
 
 _MAX_BYTES = 1 << 26
-"""An audit of 400 pictures takes some hundred kilobytes."""
+"""Maximum size of audit.json; an audit of 400 pictures takes a few hundred kilobytes."""
 
 
 def write_outputs(
     audit: Audit, folder: Path, capture: Path, *, has_splat: bool = False
 ) -> dict[str, Path]:
-    """Writes everything but the report.
+    """Writes all files except the report.
 
     Args:
-        audit: what was found.
-        folder: a folder that exists.
-        capture: what was audited.
-        has_splat: True if the splat of a preview is there.
+        audit: the result.
+        folder: an existing folder.
+        capture: path of the audited capture.
+        has_splat: True if the folder contains the splat of a preview.
 
     Returns:
-        The files by what they hold.
+        The files written, keyed by their content.
 
     Raises:
-        OSError: the disk is full, not writable, ...
+        OSError: for example, the disk is full or not writable.
     """
     written = {
         "renderability": folder / "voxels.ply",
@@ -77,16 +77,16 @@ def write_outputs(
 
 
 def audited_capture(folder: Path) -> Path | None:
-    """Returns the path of the capture that a folder holds the audit of, or None if not known."""
+    """Returns the path of the capture whose audit is in a folder, or None if not known."""
     try:
         record = parse_json(read_bytes(folder / "audit.json", _MAX_BYTES))
         return Path(record["capture_path"])
-    except (OSError, ValueError, KeyError, TypeError):  # none, an older one, or no audit
+    except (OSError, ValueError, KeyError, TypeError):  # missing, an older version, or not an audit
         return None
 
 
 def suggested_poses(audit: Audit) -> np.ndarray:
-    """`T_world_camera` of the suggested views, in the capture's own coordinates, [k, 4, 4]."""
+    """Returns `T_world_camera` of the suggested views in the capture's coordinates, [k, 4, 4]."""
     if not audit.plan.views:
         return np.zeros((0, 4, 4))
     return audit.survey.alignment.poses_back(np.stack([view.pose for view in audit.plan.views]))
@@ -97,7 +97,7 @@ def _write_clouds(audit: Audit, values: Path, causes: Path) -> None:
     present = np.asarray(state.occupied)
     centers = np.asarray(state.center, np.float64).T[present]
     points = audit.survey.alignment.points_back(centers)
-    if not np.any(audit.survey.alignment.origin):  # near it float32 is exact enough, and usual
+    if not np.any(audit.survey.alignment.origin):  # near the origin float32 suffices and is usual
         points = points.astype(np.float32)
     evaluated = found.is_seen[present]
     shown = score_colors(found.value)[present]
@@ -215,7 +215,7 @@ def _surfaces(audit: Audit, face: float) -> dict[str, Any]:
     """Returns shares by cause, as on the page, and areas of the known surfaces.
 
     Args:
-        audit: what was found.
+        audit: the result.
         face: area of a voxel's face in the capture's units.
     """
     found = audit.diagnosis

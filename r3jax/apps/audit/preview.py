@@ -1,7 +1,7 @@
-"""A splat of the capture in about two minutes, to look at beside its audit.
+"""Trains a preview splat of the capture in about two minutes, to view beside its audit.
 
-It is trained in the audit's coordinates on small images of the pictures that were used, none held
-out: it shows holes and blur where they will be, and is no model to keep.
+It is trained in the audit's coordinates on downscaled versions of the pictures used, with none held
+out. It shows where holes and blur will appear; it is not meant as a final model.
 """
 
 from collections.abc import Callable
@@ -28,30 +28,30 @@ _SIDE = 256
 """Longer side of the images [px]."""
 
 _MOST = 150
-"""Pictures that are trained on, evenly spread."""
+"""Maximum number of training pictures, evenly spread."""
 
 _ITERATIONS, _GAUSSIANS = 3000, 20_000
 
 
 @dataclass(frozen=True)
 class Preview:
-    """What the page shows of a splat."""
+    """Images of the preview splat for the page."""
 
     stills: tuple[tuple[str, bytes], ...]
-    """Caption and PNG of a picture beside the splat's image of it, or of that alone."""
+    """Caption and PNG of each: a picture beside its rendering, or a rendering alone."""
 
 
 def train_preview(audit: Audit, folder: Path, on_progress: Callable[[str, int], None]) -> Preview:
     """Trains a splat on the pictures of an audit, and writes it as `preview.ply`.
 
     Args:
-        audit: whose capture it is.
-        folder: of the audit.
-        on_progress: for a progress bar, as in `audit`.
+        audit: the audit whose capture is trained on.
+        folder: folder of the audit.
+        on_progress: progress callback, as in `audit`.
 
     Raises:
-        ViewsError, TooLargeError, TrainingDiverged: nothing can be trained on these pictures.
-        FormatError, RunError, OSError: a picture that is missing, or a disk that is full.
+        ViewsError, TooLargeError, TrainingDiverged: a splat cannot be trained on these pictures.
+        FormatError, RunError, OSError: a picture is missing, or the disk is full.
     """
     chosen = audit.survey.chosen
     chosen = chosen[evenly_spaced(len(chosen), _MOST)]
@@ -72,7 +72,7 @@ def train_preview(audit: Audit, folder: Path, on_progress: Callable[[str, int], 
 
 
 def _stills(audit: Audit, scene: GaussianScene) -> list[tuple[str, bytes]]:
-    """Draws the best and the worst picture beside the splat, and the splat at the first view."""
+    """Draws the best and the worst picture beside their renderings, and renders the first view."""
     value = audit.renderability
     stills: list[tuple[str, bytes]] = []
     picked = {"seen best": np.nanargmax, "seen worst": np.nanargmin}

@@ -1,10 +1,10 @@
-"""The share seen well enough that suggested pictures can be expected to bring: less than simulated.
+"""Corrects the simulated gain of suggested pictures by the shortfall measured in an experiment.
 
-An audit simulates each suggested picture and finds the share of the surface that is then seen well
-enough. Fewer percent come: pictures are taken a little aside, and they show surfaces that no
-picture had shown, which are new gaps. How many fewer was measured by taking ten suggested pictures
-in embedded scenes, and auditing again (`python -m experiments.audit_promise`); a test holds these
-numbers to its result.
+An audit simulates each suggested picture and computes the share of the surface that is then seen
+well enough. The real share is smaller: pictures are taken slightly beside the suggested pose, and
+they show surfaces that no picture had shown before, which count as new gaps. The shortfall was
+measured by taking ten suggested pictures in embedded scenes and auditing again
+(`python -m experiments.audit_promise`); a test compares these numbers with its result.
 """
 
 from typing import NamedTuple
@@ -14,17 +14,17 @@ import numpy as np
 from r3jax.apps.audit.suggest import SuggestedViews
 
 LOSS = (0.036, 0.049, 0.113)
-"""Shares by which less came than was simulated: 10th percentile, median and 90th percentile."""
+"""Shortfall of the simulated share: 10th percentile, median and 90th percentile."""
 
 LOSS_RANDOM = (-0.019, 0.015, 0.043)
-"""The same of pictures at random places and directions."""
+"""The same for pictures at random places and in random directions."""
 
 _MEASURED = 10
-"""Pictures that were taken; of fewer, proportionally less is lost."""
+"""Pictures taken in the experiment; with fewer, the shortfall is proportionally smaller."""
 
 
 class Promise(NamedTuple):
-    """Shares of the surface that are seen well enough once pictures are taken."""
+    """Expected shares of the surface that are seen well enough after more pictures."""
 
     low: float
     middle: float
@@ -32,7 +32,7 @@ class Promise(NamedTuple):
 
 
 def promise(plan: SuggestedViews) -> Promise:
-    """Computes the interval in which most captures of the experiment were after the pictures."""
+    """Computes the interval that contained most captures of the experiment after the pictures."""
     return expected(plan.after.fine_share, len(plan.views), LOSS)
 
 
@@ -42,12 +42,12 @@ def random_promise(plan: SuggestedViews) -> Promise:
 
 
 def expected(simulated: float, pictures: int, loss: tuple[float, float, float]) -> Promise:
-    """Subtracts what is lost from a simulated share.
+    """Subtracts the expected shortfall from a simulated share.
 
     Args:
-        simulated: share seen well enough, once the pictures are taken.
-        pictures: their number.
-        loss: percentiles of what is lost, ascending.
+        simulated: share seen well enough after the pictures, as simulated.
+        pictures: number of pictures.
+        loss: percentiles of the shortfall, ascending.
     """
     part = min(1.0, pictures / _MEASURED)
     low, middle, high = np.clip([simulated - part * x for x in reversed(loss)], 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""The words of an audit, for the page and the console."""
+"""Writes the sentences of an audit, for the page and the console."""
 
 import shlex
 from collections.abc import Iterable
@@ -21,7 +21,7 @@ MEANING = {
     "unseen": "borders on free space, but no picture shows it",
     NOT_KNOWN: "no depth here: plain, dark or glossy surfaces, or seen from one side only",
 }
-"""What each cause means, for the table."""
+"""Meaning of each cause, for the table."""
 
 REMEDY = {
     "fine": "",
@@ -40,7 +40,7 @@ SHORT = {
     "distance": "only from too far away",
     "noise": "in contradictory colors",
 }
-"""How a surface with each cause was seen."""
+"""How a surface with each cause was seen, to complete "seen ..."."""
 
 _DO = {
     "angle": "Go round",
@@ -55,7 +55,7 @@ GOOD, _AGAIN = 0.85, 0.3
 be taken again."""
 
 _LEAST_PROMISE = 0.5
-"""Less is no promise [percent]."""
+"""Minimum gain that is reported as a gain [percent]."""
 
 _MOST = 0.5
 """Minimum share of pictures with a pose."""
@@ -78,7 +78,7 @@ TITLES = {
 """Heading of each kind of finding."""
 
 _LEAST_TOLD, _THINGS = 0.03, 3
-"""Minimum share of a cause among the things to do, and the maximum number of these."""
+"""Minimum share of a cause to appear among the things to do, and the maximum number of these."""
 
 _DEPTH_FROM = {
     "depth": "depth images",
@@ -114,7 +114,7 @@ def length(audit: Audit, in_audit: float) -> str:
 
 
 def area(audit: Audit, in_audit: float) -> str:
-    """Writes an area of the audit in the capture's units, with two digits: voxels are no finer."""
+    """Writes an area of the audit in the capture's units, to two digits, as voxels are coarse."""
     return f"{two_digits(in_audit * audit.survey.length(1.0) ** 2)} {audit.survey.unit}²"
 
 
@@ -169,7 +169,7 @@ def verdict(audit: Audit) -> list[str]:
 
 
 def first_things(audit: Audit) -> list[str]:
-    """Lists remarks that come before the verdict: pictures that are not part of it."""
+    """Lists remarks to show before the verdict: pictures that were left out of it."""
     remark = audit.source.remark
     return [*([] if remark is None else [remark]), *unread(audit), *without_depth(audit)]
 
@@ -177,7 +177,7 @@ def first_things(audit: Audit) -> list[str]:
 def _surfaces(audit: Audit) -> str:
     """Describes how much of the surface was seen well enough.
 
-    For pictures from one place, that is not known.
+    This is not known if all pictures were taken from one place.
     """
     survey = audit.survey
     if survey.is_one_place:
@@ -205,7 +205,7 @@ def _surfaces(audit: Audit) -> str:
 
 
 def _promises(audit: Audit) -> list[str]:
-    """Says how well the frames are covered, and what further views would add."""
+    """Describes how well the frames are covered, and the expected gain of further views."""
     sentences: list[str] = []
     mean = audit.mean_renderability
     worst = audit.frames[int(np.nanargmin(np.r_[audit.renderability, np.inf])) % len(audit.frames)]
@@ -225,16 +225,16 @@ def _promises(audit: Audit) -> list[str]:
 
 
 def promised(audit: Audit) -> str:
-    """Says what the suggested pictures can be expected to bring, and as many at random places."""
+    """Describes the expected gain of the suggested pictures, and of as many at random places."""
     count = len(audit.plan.views)
     these = "This picture" if count == 1 else f"These {count} pictures"
     if not audit.source.is_complete:
-        return f"How much {these[:1].lower()}{these[1:]} would bring is not known without depth."
+        return f"How much {these[:1].lower()}{these[1:]} would add is not known without depth."
     now = 100 * audit.diagnosis.fine_share
     low, middle, high = (100 * share for share in promise(audit.plan))
     if middle - now < _LEAST_PROMISE:
         what = "it" if count == 1 else "they"
-        return f"{now:.0f} % hardly rise any more by pictures: {what} would show what is dark."
+        return f"More pictures hardly raise the {now:.0f} %: {what} would show unseen places."
     drawn = 100 * random_promise(audit.plan).middle
     verb, as_many = ("raises", "one") if count == 1 else ("raise", "as many")
     return (
@@ -279,8 +279,8 @@ def without_depth(audit: Audit) -> list[str]:
         return []
     what = "have no depth" if audit.source.is_complete else "show no point"
     return [
-        f"{count} of the {audit.faults.looked_at} pictures {what}: they are left out, and their "
-        "surfaces are not known."
+        f"{count} of the {audit.faults.looked_at} pictures {what}: they are left out, and the "
+        "surfaces in them are not known."
     ]
 
 
@@ -294,17 +294,17 @@ def cause_share(audit: Audit, cause: str) -> float:
 
 
 def saturation() -> str:
-    """Explains what R cannot measure in a capture that is covered well."""
+    """Explains the limit of R in a well-covered capture."""
     return (
-        f"With a mean of {SATURATED:g} or more, the pictures are covered well by each other, and R "
-        "does not tell which of them renders better: for 250 pictures of a kitchen with a mean of "
-        "0.96, each held out once, the rank correlation of R and PSNR was 0.00. So these pictures "
-        "are not ranked; only better pictures, not more of them, would improve the result."
+        f"With a mean of {SATURATED:g} or more, the pictures cover each other well, and R cannot "
+        "predict which of them renders better: for 250 pictures of a kitchen with a mean of 0.96, "
+        "each held out once, the rank correlation of R and PSNR was 0.00. These pictures are "
+        "therefore not ranked; only better pictures, not more of them, would improve the result."
     )
 
 
 def select_command(capture: Path | None) -> str:
-    """Returns the command that keeps the fewest frames which give nearly all."""
+    """Returns the command that keeps the fewest frames with nearly all of the quality."""
     return f"r3jax select {'CAPTURE' if capture is None else shlex.quote(str(capture))} --gain 0.95"
 
 
@@ -319,7 +319,7 @@ def reason(audit: Audit, view: Suggestion, letters: Iterable[str]) -> str:
     parts: list[str] = []
     total = sum(view.causes.values())
     if view.num_mended:
-        parts.append(f"about {area(audit, view.num_mended * face)} would then be seen well enough")
+        parts.append(f"about {area(audit, view.num_mended * face)} would become seen well enough")
     if total:
         named = sorted(view.causes, key=lambda cause: -view.causes[cause])
         shares = [
@@ -347,16 +347,16 @@ def method(audit: Audit) -> list[str]:
         f"Voxels of {length(audit, survey.voxel_size)}, cells of free space of "
         f"{length(audit, survey.cell_size)}, visible up to {length(audit, 5.0)}; the depths have "
         f"the median {survey.median_depth:.3g} {survey.unit} and the 95th percentile "
-        f"{survey.far_depth:.3g} {survey.unit}. Sizes that are not given are derived from them.",
+        f"{survey.far_depth:.3g} {survey.unit}. Sizes that were not set are derived from these.",
         vertical(audit),
         "Renderability R (arXiv 2601.07484) of a surface from a position is bias × noise × "
         "resolution: the angle to the nearest direction from which it was seen, the consistency "
         "of its color, and the smallest distance from which it was seen.",
         f"Surfaces: every voxel is scored from those of {len(audit.standpoints)} standpoints that "
-        "see it, with the camera of most pictures; its score is the mean. Areas count one face of "
+        "see it, with the most common camera; its score is the mean. Areas count one face of "
         "each voxel on the floor, walls, ceiling and all sides of furniture, so they are several "
-        "times the floor area. With noisy depth walls are several voxels thick, and areas too "
-        "large.",
+        "times the floor area. With noisy depth, walls are several voxels thick, and areas are "
+        "overestimated.",
         _standing(audit),
     ]
     pixels = (
@@ -392,9 +392,9 @@ def method(audit: Audit) -> list[str]:
         f"Views: candidates are {len(audit.places.eyes)} positions {where}, with {DIRECTIONS} "
         f"directions each; at least {100 * OVERLAP:.0f} % of a view must show known surfaces, so "
         "that the picture can be registered. The candidate that raises the mean renderability of "
-        "all surfaces most is simulated before the next one is chosen. What is expected is what is "
-        "simulated, less what was missing in embedded scenes in which the pictures were taken "
-        "(docs/results/audit.md)."
+        "all surfaces most is simulated before the next one is chosen. The expected gain is the "
+        "simulated one, less the shortfall measured in embedded scenes in which the pictures were "
+        "really taken (docs/results/audit.md)."
     )
     if (moved := origin(audit)) is not None:
         sentences.append(moved)
@@ -414,9 +414,9 @@ def _standing(audit: Audit) -> str:
         )
     over = len(audit.places.eyes) - audit.places.num_standing
     return (
-        "A person can stand at these positions: depth shows nothing in the way between shin and "
-        f"head. {over} more positions, where a camera can be held with an arm, are searched for "
-        "views, too."
+        "A person can stand at these positions: depth shows no obstacle between shin and head. "
+        f"{over} more positions, which a camera reaches at arm's length, are also searched for "
+        "views."
     )
 
 
@@ -432,7 +432,7 @@ def state(audit: Audit) -> str:
 
 
 def _severe(audit: Audit) -> list[str]:
-    """Returns the headings of the faults that spoil a model, however much is seen."""
+    """Returns the headings of the faults that spoil a model regardless of coverage."""
     return [TITLES[f.kind] for f in audit.faults.findings if f.kind in _SEVERE]
 
 
@@ -463,7 +463,7 @@ def headline(audit: Audit) -> str:
 
 
 def advice(audit: Audit) -> list[tuple[str, str]]:
-    """Chooses up to three things to do, the most important first: in bold, and the rest."""
+    """Chooses up to three things to do, the most important first: heading and explanation."""
     survey, faults = audit.survey, audit.faults
     if survey.doubt is not None or not faults.fits:
         return [("Check the depth and the poses", survey.doubt or CONTRADICTED)]

@@ -11,10 +11,10 @@ _MOST_VIEWS = 200
 
 @dataclass(frozen=True)
 class AuditSettings(SurveySettings):
-    """How a capture is audited.
+    """Settings of an audit.
 
     Raises:
-        ValueError: a setting that makes no sense; names the option.
+        ValueError: an invalid setting; names the option.
     """
 
     folds: int = 8
@@ -28,10 +28,10 @@ class AuditSettings(SurveySettings):
     """Maximum number of positions searched for views."""
 
     num_standpoints: int = 24
-    """Maximum number of these positions from which every surface is evaluated."""
+    """Maximum number of these positions used as standpoints to evaluate the surfaces."""
 
     seed: int = 0
-    """Random seed of the views that the suggested ones are compared with."""
+    """Random seed of the random views that serve as a baseline for the suggested ones."""
 
     def __post_init__(self) -> None:
         """Refuses invalid settings."""

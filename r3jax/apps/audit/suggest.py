@@ -1,24 +1,24 @@
-"""Which further views would help most: one after the other, each imagined before the next.
+"""Suggests the most useful further views, one after another; each is simulated before the next.
 
-Candidates: every place where somebody could stand gets its panorama (arXiv 2601.07484), the utility
-of all directions at once, and looks along its best directions; views that show too little of what
-is known are left out. What a view would add to the renderability of all surfaces is computed
+Candidates: for every place where a person could stand, a panorama (arXiv 2601.07484) gives the
+utility of all directions at once, and the best directions become candidate views. Views that show
+too little known surface are left out. The gain in renderability over all surfaces is computed
 exactly, after `simulate_view`:
 
     gain(view) = sum over voxels of mean over the standpoints that see it of (R after - R before)
                  + the utility of the unexplored cells that the view shows
 
-in voxels: 1 is a voxel that could not be rendered at all, and then perfectly. Only voxels that the
-view shows can change, and only those with a deficit can gain.
+The unit is a voxel: a gain of 1 is a voxel that goes from not renderable at all to perfect. Only
+voxels in view can change, and only those with a deficit can gain.
 
-Of all candidates the one with the largest gain is taken (`LazyGreedy`, the policy that `decide`
-asks), the map goes on as if it had been, the unexplored cells that it shows count no longer, and
-the others are asked again: lazy greedy (Minoux 1978). A gain hardly ever grows by other views, so
-an old one is as good as an upper bound, and only candidates whose old gain is above the best new
-one are asked again.
+The candidate with the largest gain is chosen (by `LazyGreedy`, the policy that `decide` calls).
+The map is then updated as if the view had been taken, the unexplored cells in its view no longer
+count, and the other candidates are evaluated again by lazy greedy (Minoux 1978). Other views hardly
+ever increase a gain, so an old gain serves as an upper bound: only candidates whose old gain
+exceeds the best new one are evaluated again.
 
-Beside it, as many views at random from the same places say how much of the gain is owed to the
-choice.
+The same number of random views from the same places serves as a baseline, which shows how much of
+the gain is due to the selection.
 
 Shape symbols: p places or standpoints; B bins of the panorama; C candidates; N rows of the map.
 """
@@ -63,7 +63,7 @@ from r3jax.scoring.utility import visible_unexplored
 from r3jax.visibility.views import pinhole_view
 
 _ENOUGH = 0.95
-"""A voxel with this mean renderability has hardly anything to gain."""
+"""Voxels with at least this mean renderability have hardly anything to gain."""
 
 
 def view_gains(
@@ -79,12 +79,12 @@ def view_gains(
 
     Args:
         state: the map.
-        grid: whose unexplored cells count, `config.lambda1` each.
+        grid: the grid; each unexplored cell counts `config.lambda1`.
         demand: the standpoints, and the voxels that each sees.
-        answers: their scores of the map as it is.
-        camera: of the views.
-        poses: [C, 4, 4] [audit units].
-        config: of all scores.
+        answers: their scores of the current map.
+        camera: camera of the views.
+        poses: candidate poses, [C, 4, 4] [audit units].
+        config: settings of all scores.
     """
     T = jnp.asarray(poses, dtype=jnp.float32)
     part = functools.partial(_gains, state, grid, demand, answers, camera, config)
@@ -156,20 +156,20 @@ def _gains(
 
 
 DIRECTIONS = 6
-"""Directions in which a candidate looks from every place."""
+"""Number of candidate directions at each place."""
 
 _APART = 40.0
-"""Between the directions of one place [deg]."""
+"""Minimum angle between the directions of one place [deg]."""
 
 OVERLAP = 0.4
-"""Share of a view's pixels that must show what is known already: an image of nothing but the
-unknown cannot be registered with the others."""
+"""Minimum share of a view's pixels that must show known surfaces: without overlap the image cannot
+be registered with the others."""
 
 _BATCH = 8
-"""Candidates that are asked again at once."""
+"""Number of candidates evaluated again in one batch."""
 
 _LEAST_GAIN = 1.0
-"""A view that gains less than one voxel is not worth taking."""
+"""Minimum gain of a suggested view: one voxel."""
 
 
 @dataclass(frozen=True)
@@ -180,54 +180,54 @@ class Suggestion:
     """`T_world_camera`, [4, 4] float64 [audit units]."""
 
     gain: float
-    """What it was chosen for [voxels]; see `gains`."""
+    """Gain when it was chosen [voxels]; see `view_gains`."""
 
     cells: np.ndarray
-    """Unseen edges that it shows, as flat indices of the grid's cells."""
+    """Unseen edge cells in view, as flat indices of the grid."""
 
     shown: np.ndarray
-    """Rows of the voxels that it shows."""
+    """Rows of the voxels in view."""
 
     num_mended: int
-    """Voxels that were not fine from where a person would stand, and are fine after it."""
+    """Number of voxels that become fine, from where a person would stand, through this view."""
 
     causes: dict[str, int]
-    """Number of voxels that it shows and that were not fine, by cause."""
+    """Number of voxels in view that were not fine, by cause."""
 
     mean_after: float
-    """Mean renderability of all surfaces once it is taken."""
+    """Mean renderability of all surfaces after this view."""
 
     fine_after: float
-    """Share of the surfaces that are fine once it is taken."""
+    """Share of the surfaces that are fine after this view."""
 
     rank: int
-    """1 for the view that was chosen first; the numbers after it count those of lower rank."""
+    """Order of selection, 1 for the first; the numbers after a view include all of lower rank."""
 
     feet: np.ndarray
-    """Where one stands to take it, [3] [audit units]; NaN: not known."""
+    """Place on the floor where a person stands to take it, [3] [audit units]; NaN if not known."""
 
     is_over: bool
-    """True if the camera is held out from there with an arm."""
+    """True if the camera must be held out at arm's length from there."""
 
 
 @dataclass(frozen=True)
 class SuggestedViews:
-    """The suggested views, and what they promise."""
+    """The suggested views and their expected gain."""
 
     views: tuple[Suggestion, ...]
-    """In the order of a walk."""
+    """The views, in walking order."""
 
     before: Diagnosis
-    """Diagnosis of the capture as it is."""
+    """Diagnosis of the current capture."""
 
     after: Diagnosis
-    """Diagnosis once all views are taken, as far as it can be predicted."""
+    """Predicted diagnosis after all views."""
 
     random_mean: tuple[float, ...]
-    """Mean renderability of all surfaces after each of as many random views."""
+    """Mean renderability of all surfaces after each of the same number of random views."""
 
     random_fine: tuple[float, ...]
-    """Share of the surfaces that are fine after each of these."""
+    """Share of the surfaces that are fine after each random view."""
 
     @property
     def ranked(self) -> tuple[Suggestion, ...]:
@@ -237,13 +237,13 @@ class SuggestedViews:
 
 @dataclass(frozen=True)
 class Task:
-    """What does not change from view to view."""
+    """Inputs that stay the same for all views."""
 
     camera: Camera
-    """Camera of the views; its focal length in the map's unit."""
+    """Camera of the views, with the focal length in the map's unit."""
 
     demand: Demand
-    """From where the result will be looked at."""
+    """Standpoints from which the result will be viewed."""
 
     config: ScoringConfig
     """Settings of all scores."""
@@ -256,18 +256,18 @@ class Task:
 
 @dataclass(frozen=True)
 class Memory:
-    """What is remembered from one suggestion to the next."""
+    """State kept from one suggestion to the next."""
 
     gains: np.ndarray
-    """Gain of every candidate when it was last asked, inf before that, [C] [voxels]."""
+    """Latest computed gain of every candidate, inf before the first, [C] [voxels]."""
 
     diagnosis: Diagnosis | None = None
-    """Diagnosis of the map that the latest view was chosen on; None before the first."""
+    """Diagnosis of the map on which the latest view was chosen; None before the first."""
 
 
 @dataclass(frozen=True, eq=False)
 class LazyGreedy:
-    """Policy of an audit: of all candidates, the view that gains most (see the module)."""
+    """Policy of an audit: chooses the candidate with the largest gain (see the module)."""
 
     task: Task
 
@@ -277,12 +277,12 @@ class LazyGreedy:
     name = "audit"
 
     def init(self, camera: Camera, grid: OccupancyGrid, *, key: Array) -> Memory:
-        """Knows no gain yet."""
+        """Creates a memory without any gains."""
         del camera, grid, key
         return Memory(np.full(len(self.poses), np.inf))
 
     def observe(self, state: Memory, map_state: MapState, frame: Frame) -> Memory:
-        """Forgets all gains: what was really seen may raise them, unlike what is imagined."""
+        """Resets all gains: unlike a simulated view, a real frame may increase them."""
         del state, map_state, frame
         return Memory(np.full(len(self.poses), np.inf))
 
@@ -296,7 +296,7 @@ class LazyGreedy:
         key: Array,
     ) -> tuple[Decision | None, Memory, PlanInfo]:
         """Chooses the candidate with the largest gain, or None if none gains a voxel."""
-        del key  # nothing is drawn
+        del key  # no randomness
         gains, num = state.gains.copy(), len(self.poses)
         answers, diagnosis = self.task.evaluate(map_state)
         best = _best(gains, map_state, grid, self.task, answers, self.poses)
@@ -304,7 +304,7 @@ class LazyGreedy:
         if best is None:
             return None, memory, PlanInfo(DecisionOutcome.NO_CANDIDATE, num, num)
         pose = self.poses[best]
-        # A person finds the way: it costs nothing, and leads straight.
+        # A person finds the way: the path is straight and free.
         way = np.stack([T_world_camera[:3, 3], pose[:3, 3]])
         length = float(np.linalg.norm(way[1] - way[0]))
         utilities = {"total": gains, "path": np.zeros(num)}
@@ -319,7 +319,7 @@ class LazyGreedy:
         T_world_camera: np.ndarray,
         waypoints: np.ndarray,
     ) -> Memory:
-        """Remembers nothing of a path."""
+        """Returns the memory unchanged: paths do not matter here."""
         del map_state, grid, T_world_camera, waypoints
         return state
 
@@ -339,12 +339,12 @@ def suggest(
 
     Args:
         state: the map.
-        grid: whose unexplored cells count: those that somebody could ever see.
+        grid: the grid; its unexplored cells are those that could be seen at all.
         task: camera, standpoints, settings.
-        places: where a view may be taken.
-        num: views wanted; fewer come where nothing is left to be gained.
-        start: where the walk begins, [3] [audit units].
-        seed: of the random views.
+        places: positions at which a view may be taken.
+        num: number of views; fewer are returned if no candidate gains enough.
+        start: start of the walk, [3] [audit units].
+        seed: random seed of the random views.
         on_view: called after each view.
     """
     greedy = LazyGreedy(task, candidate_poses(state, grid, task, places.eyes) if num else _NO_POSES)
@@ -375,11 +375,11 @@ def suggest(
 
 
 def walking_order(eyes: np.ndarray, start: np.ndarray) -> list[int]:
-    """Orders views so that one walks little: always to the nearest one that is left.
+    """Orders views for a short walk by always choosing the nearest remaining one.
 
     Args:
         eyes: positions, [k, 3].
-        start: where one is, [3].
+        start: start of the walk, [3].
     """
     left, here, order = list(range(len(eyes))), start, list[int]()
     while left:
@@ -407,12 +407,12 @@ def candidate_poses(
     u, _, vt = np.linalg.svd(poses[:, :3, :3])
     poses[:, :3, :3] = u @ vt
     known = view_coverage(state, task.camera, poses, task.config)
-    # Where the map has gaps everywhere, the fullest half of the views is full enough.
+    # If the map has gaps everywhere, the half of the views with the most coverage is accepted.
     return poses[known >= min(OVERLAP, float(np.median(known)))]
 
 
 def _apart(scores: np.ndarray, lattice: np.ndarray) -> np.ndarray:
-    """Returns indices of the best directions at a place, at least `_APART` degrees apart."""
+    """Selects the best directions at a place, at least `_APART` degrees apart, as indices."""
     left = scores.astype(np.float64)
     chosen: list[int] = []
     for _ in range(DIRECTIONS):
@@ -430,7 +430,7 @@ def _best(
     answers: StandpointScores,
     poses: np.ndarray,
 ) -> int | None:
-    """Finds the candidate with the largest gain now, updating `gains` as far as needed.
+    """Finds the candidate with the largest current gain, updating `gains` as far as needed.
 
     Returns None if no candidate gains enough.
     """
@@ -442,7 +442,7 @@ def _best(
 
 
 class _Taken(NamedTuple):
-    """A view that was chosen, and what it shows."""
+    """A chosen view and the voxels and cells in view."""
 
     decision: Decision
     shown: np.ndarray
@@ -452,7 +452,7 @@ class _Taken(NamedTuple):
 
 
 def _imagine(planner: Planner, task: Task, decision: Decision) -> tuple[Planner, _Taken]:
-    """Simulates taking a view: returns the planner after it, and what the view shows."""
+    """Simulates taking a view; returns the updated planner and the voxels and cells in view."""
     T = jnp.asarray(decision.T_world_camera, dtype=jnp.float32)
     cells = visible_unexplored(planner.map_state, planner.grid, task.camera, T, task.config)
     after, shown = simulate_view(planner.map_state, task.camera, T, task.config)
@@ -485,7 +485,7 @@ def _suggestion(
 
 
 def random_poses(places: np.ndarray, num: int, seed: int) -> np.ndarray:
-    """Draws views at random places, in directions as people look: mostly level, [num, 4, 4]."""
+    """Draws views at random places, mostly level as people look, [num, 4, 4]."""
     rng = np.random.default_rng(seed)
     directions = rng.normal(size=(num, 3)) * [1.0, 1.0, 0.3]
     return poses_along(places[rng.integers(len(places), size=num)], directions)

@@ -364,7 +364,7 @@ def test_a_model_without_images_is_audited_by_its_points(folder):
     assert verdict(found)[0].startswith("None of the 8 pictures was found")
     (remark,) = picture_faults(found)["remarks"]
     assert "sharp" not in remark
-    assert "where they say" not in remark
+    assert "consistent with" not in remark
 
 
 def test_everything_written_is_in_the_captures_coordinates(cloud, tmp_path):

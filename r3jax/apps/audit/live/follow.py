@@ -1,9 +1,9 @@
-"""Guides a person who scans: maps frames as they arrive and decides on the next view meanwhile.
+"""Guides a person who scans: maps frames as they arrive and decides on the next view in parallel.
 
-The same three verbs as in a robot: `start`, `observe`, `decide`. A frame is on the page as soon as
-it is in the map; the decision is made in a thread of its own, so that no frame waits for it. A
-view to take stays the same until the camera has been near it, or some frames have come: advice
-that changes with every step cannot be followed.
+It uses the same three verbs as a robot: `start`, `observe`, `decide`. A frame appears on the page
+as soon as it is in the map. The decision is made in a separate thread, so that no frame waits for
+it. The suggested view stays the same until the camera has been near it or several frames have
+arrived, because advice that changes with every step cannot be followed.
 """
 
 import queue
@@ -30,28 +30,28 @@ from r3jax.planning.planner import Planner, decide, observe, start
 from r3jax.planning.policy import Decision
 
 _POLL = 0.05
-"""Between two looks at the folder [s]."""
+"""Interval at which the folder is polled [s]."""
 
 _HALF_SIZE = np.array([10.0, 10.0, 3.5])
-"""The space that is explored: so far round the first camera [m]."""
+"""Half-size of the explored box around the first camera [m]."""
 
 _RIM = 2.0
-"""A camera nearer to the rim than this makes the space larger, by as much again [m]."""
+"""The box grows when a camera comes closer to its boundary than this [m]."""
 
 _TILTED = 5.0
-"""The vertical is estimated; if it was off by more, all is mapped again [deg]."""
+"""Change of the estimated vertical above which everything is mapped again [deg]."""
 
 _NEAR, _FACING = 0.5, 30.0
-"""A view counts as taken from as near as this [m], in a direction as near as this [deg]."""
+"""A view counts as taken within this distance [m] and this angle [deg]."""
 
 _PATIENCE = 8
-"""Frames after which another view is looked for, whatever happened to the last one."""
+"""Number of frames after which a new view is chosen, even if the last one was not taken."""
 
 _COMPARED = 8
-"""Latest frames that a new one is compared with for blur and light."""
+"""Number of recent frames with which a new one is compared for blur and light."""
 
 _CAPACITY = 1 << 17
-"""Rows of the map at first: 200 square meters of surface."""
+"""Initial number of rows of the map: 200 square meters of surface."""
 
 
 _WARNINGS: dict[Kind, str] = {
@@ -69,15 +69,15 @@ _WARNINGS: dict[Kind, str] = {
 
 
 class Guide:
-    """Maps frames and asks for views. A context manager: leaving it ends its thread."""
+    """Maps frames and decides on views. A context manager: leaving it ends its thread."""
 
     def __init__(self, page: GuidePage, up: str | None = None, policy: str = "r3-pano"):
-        """Knows nothing yet.
+        """Creates a guide without frames.
 
         Args:
-            page: shows it.
-            up: axis of the capture that points up; None: as it says, or as the cameras were held.
-            policy: decides on views.
+            page: the page that shows progress and advice.
+            up: axis of the capture that points up; None: from its format, or estimated.
+            policy: name of the policy that chooses views.
         """
         self._page, self._up_name, self._policy = page, up, policy
         self._planner: Planner | None = None
@@ -110,7 +110,7 @@ class Guide:
         self._page.forget()
 
     def add(self, source: Source, arrival: Arrival, *, is_latest: bool) -> None:
-        """Maps a frame; shows what is known with it, unless others have come since."""
+        """Maps a frame and shows the progress, unless newer frames have arrived."""
         depth, camera = arrival.picture[1], source.camera(arrival.index)
         self._normals[arrival.index] = block_normals(depth, camera, np.eye(3))
         if self._planner is None:
@@ -132,7 +132,7 @@ class Guide:
     def _up(self, source: Source) -> np.ndarray:
         """Returns the vertical.
 
-        If it is estimated, the estimate is renewed whenever the number of frames has doubled.
+        An estimated vertical is updated whenever the number of frames has doubled.
         """
         if self._up_name is not None:
             return up_of(self._up_name)
@@ -160,7 +160,7 @@ class Guide:
             self._bounds,
             self._policy,
             starts=[poses[arrival.index]],
-            # As the audit of the finished capture has it.
+            # The same orientation as in the audit of the finished capture.
             config=MappingConfig(capacity=_CAPACITY, remove_moved=False),
         )
 
@@ -185,7 +185,7 @@ class Guide:
         return bool(is_near and pose[:3, 2] @ self._target[:3, 2] > np.cos(np.radians(_FACING)))
 
     def _decide(self) -> None:
-        """Answers the latest question, again and again."""
+        """Decides on the next view for the latest frame, in a loop."""
         key, number = jax.random.key(0), 0
         while (question := self._latest()) is not None:
             planner, frame = question
@@ -194,8 +194,8 @@ class Guide:
                 decision, _, _ = decide(
                     planner, frame.T_world_camera, jax.random.fold_in(key, number)
                 )
-            except Exception as error:  # whatever it was: the next frame may do better
-                self._page.say("No view could be chosen here; go on.", str(error))
+            except Exception as error:  # of any kind: the next frame may succeed
+                self._page.say("No view could be chosen here; keep scanning.", str(error))
             else:
                 self._show(frame, decision)
 
@@ -215,7 +215,7 @@ class Guide:
         return self
 
     def __exit__(self, *_: Any) -> None:
-        """Ends the thread once it has answered."""
+        """Ends the thread after its current decision."""
         self._questions.put(None)
         self._thread.join()
         self._growth.wait()
@@ -230,18 +230,18 @@ def follow(
     topics: Topics | None = None,
     stop: threading.Event | None = None,
 ) -> Source | None:
-    """Follows a growing capture until Ctrl-C, or until it is told to stop.
+    """Follows a growing capture until Ctrl-C or until `stop` is set.
 
     Args:
-        path: the folder, a transforms.json, or a ROS bag; nothing in it is written.
-        page: shows what is done and where to go next.
-        scratch: an empty folder of our own, which stays as long as the result is read.
+        path: the folder, a transforms.json, or a ROS bag; it is only read.
+        page: shows progress and where to go next.
+        scratch: an empty temporary folder, which must exist as long as the result is read.
         up: axis of the capture that points up.
-        topics: names of a bag's topics and frames; None: all are guessed.
-        stop: set by another thread.
+        topics: names of a bag's topics and frames; None to detect them.
+        stop: event set by another thread.
 
     Returns:
-        What came in, to be audited; None if nothing did.
+        The frames received, ready to be audited; None if there were none.
 
     Raises:
         ValueError: the capture has no depth images, or is a bag that cannot be followed.
@@ -259,7 +259,7 @@ def follow(
 
 
 def _step(capture: GrowingCapture, guide: Guide, page: GuidePage) -> bool:
-    """Looks once for new frames and maps them; returns True if there were any."""
+    """Checks once for new frames and maps them; returns True if there were any."""
     source, arrivals, has_moved = capture.look()
     if source is None:
         if capture.waiting_for:
@@ -267,7 +267,7 @@ def _step(capture: GrowingCapture, guide: Guide, page: GuidePage) -> bool:
         return False
     if has_moved or (arrivals and guide.needs_anew(capture.source or source)):
         guide.forget()
-        page.say("Mapping everything again ...", "poses were corrected, or the place is larger")
+        page.say("Mapping everything again ...", "poses were corrected, or the place has grown")
         earlier: Arrival | None = None
         for arrival in capture.again(source):
             if earlier is not None:

@@ -1,11 +1,11 @@
-"""A growing capture, looked at again and again: which frames are new, which poses were corrected.
+"""Polls a growing capture for new frames and corrected poses.
 
-A frame counts once it can be read whole; one that cannot is tried again. Frames are known by their
-names, so they may come in any order.
+A frame counts once it can be read completely; until then it is tried again. Frames are identified
+by their names, so they may arrive in any order.
 
-Readers refuse a folder whose numbers of images, depth images and poses differ, as they should. Of
-a folder that grows, the frames that are complete are linked into a scratch folder, which is read
-instead; in the folder itself nothing is written.
+Readers refuse a folder whose numbers of images, depth images and poses differ. For a growing
+folder, the complete frames are therefore linked into a scratch folder, which is read instead;
+nothing is written into the folder itself.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ from r3jax.geometry.cameras import angle_between
 
 _IMAGES = (".png", ".jpg")
 _SETTLED = 0.5
-"""A last line without its end counts once the file has been left alone for so long [s]."""
+"""A last line without a line end counts once the file has not changed for this long [s]."""
 
 _NUMBERS = 16
 """Of a pose."""
@@ -41,14 +41,14 @@ def stage(path: Path, scratch: Path) -> Path:
 
     Args:
         path: the capture; nothing in it is changed.
-        scratch: a folder of our own, the same from call to call.
+        scratch: a temporary folder, the same from call to call.
 
     Returns:
-        What to read: the scratch folder; or the capture itself where its format names every frame
-        (a transforms.json), or is none that is known to grow.
+        The path to read: the scratch folder, or the capture itself if its format names every frame
+        (a transforms.json) or is not one that is known to grow.
 
     Raises:
-        OSError: not permitted.
+        OSError: permission denied.
     """
     if is_recording(path):
         return _stage_recording(path, scratch)
@@ -73,10 +73,10 @@ def _stage_recording(path: Path, scratch: Path) -> Path:
 
 
 def _in_order(stems: list[str], poses: int) -> list[str]:
-    """Returns the names that certainly belong to the first poses.
+    """Returns the names that can be assigned to the first poses without doubt.
 
-    If there are as many names as poses, all of them do. Otherwise, if names are numbers, only those
-    before the first gap: a frame that is late would take another one's pose.
+    With as many names as poses, these are all names. Otherwise, if names are numbers, only those
+    before the first gap, because a delayed frame would shift the poses of the following ones.
     """
     if len(stems) == poses or not all(stem.isdecimal() for stem in stems):
         return stems[:poses]
@@ -87,10 +87,10 @@ def _in_order(stems: list[str], poses: int) -> list[str]:
 
 
 def complete_lines(path: Path) -> list[str]:
-    """Reads the complete lines of a text of poses: 16 numbers and a line end.
+    """Reads the complete lines of a text file of poses: 16 numbers and a line end.
 
     Raises:
-        OSError: not permitted.
+        OSError: permission denied.
     """
     text = path.read_text(errors="replace") if path.exists() else ""
     whole, _, rest = text.rpartition("\n")
@@ -101,7 +101,7 @@ def complete_lines(path: Path) -> list[str]:
 
 
 def _stage_numbered(path: Path, scratch: Path) -> Path:
-    """Links the complete frames of 7-Scenes' layout: an image, a depth image and a pose each."""
+    """Links the complete frames of a 7-Scenes folder: an image, a depth image and a pose each."""
     files = {entry.name: entry for entry in path.iterdir() if entry.name.startswith("frame-")}
     bases = {name.partition(".")[0] for name in files}
     kept: list[Path] = []
@@ -122,7 +122,7 @@ def _by_stem(folder: Path) -> dict[str, Path]:
 
 
 def _link(folder: Path, files: Iterable[Path], *, keep: bool = False) -> None:
-    """Makes a folder hold links to these files, and no others unless they are kept."""
+    """Fills a folder with links to these files; other links in it are removed unless `keep`."""
     folder.mkdir(parents=True, exist_ok=True)
     wanted = {file.name: file for file in files}
     present = {entry.name for entry in os.scandir(folder) if entry.is_symlink()}
@@ -133,42 +133,42 @@ def _link(folder: Path, files: Iterable[Path], *, keep: bool = False) -> None:
 
 
 _MOVED, _TURNED = 0.02, 1.0
-"""Poses that were corrected by less stay where they are [m], [deg]."""
+"""Corrections of poses below this are ignored [m], [deg]."""
 
 _BATCH = 8
-"""Frames that are read at once at most: a folder may hold thousands from the start."""
+"""Maximum number of frames read at once, as a folder may contain thousands from the start."""
 
 _AGAIN = 1.0
-"""A folder is looked at again after so long, whatever its times say [s]."""
+"""Interval after which a folder is scanned even if its time stamps have not changed [s]."""
 
 _LARGE = (".png", ".jpg", ".jpeg")
-"""Files that are not looked at one by one: their folder says when another one comes."""
+"""Suffixes of files that are not checked one by one: the time of their folder shows new ones."""
 
 
 @dataclass(frozen=True)
 class Arrival:
-    """A frame that has come in."""
+    """A newly received frame."""
 
     name: str
-    """Its name, for the reader."""
+    """Its name in reports."""
 
     index: int
-    """Its number in the source as it is now."""
+    """Its index in the current source."""
 
     picture: Picture
     """Its colors and depth."""
 
 
 class GrowingCapture:
-    """What has come in of a capture; reads it, and writes nothing into it."""
+    """The frames received so far of a growing capture, which is only read."""
 
     def __init__(self, path: Path, scratch: Path, topics: Topics | None = None):
-        """Looks at nothing yet.
+        """Stores the arguments; nothing is read yet.
 
         Args:
-            path: the capture, which may not be there yet.
-            scratch: an empty folder of our own, which stays until the source is read no more.
-            topics: names of a ROS bag's topics and frames; None: all are guessed.
+            path: the capture, which need not exist yet.
+            scratch: an empty temporary folder, which must exist as long as the source is read.
+            topics: names of a ROS bag's topics and frames; None to detect them.
         """
         self._path, self._scratch, self._topics = path, scratch, topics
         self._bag: FollowedBag | None = None
@@ -177,22 +177,22 @@ class GrowingCapture:
         self._taken: dict[str, np.ndarray] = {}
         self._is_pending, self._when = False, 0.0
         self.waiting_for = "the first frame"
-        """Why nothing more comes in, in words; empty if all is in."""
+        """What the capture is waiting for; empty if all frames were read."""
 
     @property
     def source(self) -> Source | None:
-        """The frames that came in so far, in the capture's order; None before the first."""
+        """The frames received so far, in the capture's order; None before the first."""
         if self._source is None or not self._taken:
             return None
         kept = [i for i, key in enumerate(_keys(self._source)) if key in self._taken]
         return subset(self._source, kept)
 
     def look(self) -> tuple[Source | None, list[Arrival], bool]:
-        """Looks once.
+        """Checks once for new frames.
 
         Returns:
-            The capture as it is now, some frames that are new in it, and whether poses of earlier
-            ones were corrected.
+            The current capture, some of its new frames, and whether poses of earlier frames were
+            corrected.
 
         Raises:
             ValueError: the capture has no depth images, or is a bag that cannot be followed.
@@ -207,7 +207,7 @@ class GrowingCapture:
             self._bag = FollowedBag(self._path, self._topics)
         try:
             source = self._opened(files)
-        except (ValueError, OSError) as error:  # half of it is written; or it is none
+        except (ValueError, OSError) as error:  # incomplete, or not a capture
             self.waiting_for, self._is_pending = str(error), True
             return self._source, [], False
         if not source.is_dense:
@@ -216,7 +216,7 @@ class GrowingCapture:
         return source, self._arrivals(source), self._has_moved(source)
 
     def _opened(self, files: list[Path]) -> Source:
-        """Opens the frames that are complete by now.
+        """Opens the frames that are complete so far.
 
         Raises:
             ValueError, OSError: there are none.
@@ -266,13 +266,13 @@ class GrowingCapture:
                 continue
             try:
                 picture = source.read(index)
-            except (ValueError, OSError):  # it has gone since
+            except (ValueError, OSError):  # it was deleted meanwhile
                 continue
             yield Arrival(source.labels[index], index, picture)
 
 
 def subset(source: Source, indices: list[int]) -> Source:
-    """Returns some of the frames of a capture."""
+    """Selects frames of a capture by index."""
     return dataclasses.replace(
         source,
         poses=source.poses[indices],
@@ -293,9 +293,9 @@ def _keys(source: Source) -> list[str]:
 
 
 def _signature(path: Path) -> object:
-    """Returns a value that changes when a frame comes in.
+    """Returns a value that changes when a frame is added.
 
-    It consists of the times of the folder and of its small files.
+    It consists of the modification times of the folder and of its small files.
     """
     try:
         found = path.stat()

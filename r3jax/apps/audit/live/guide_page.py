@@ -1,14 +1,14 @@
-"""A guide's page in the browser: where to go next, what is done, what is wrong with the pictures.
+"""Serves a guide's page for the browser: where to go next, progress, and faults of the pictures.
 
     with open_guide() as page:
         print(page.url)
         planner = r3jax.observe(planner, frame)
-        page.observed(planner, frame)              # what is done
+        page.observed(planner, frame)              # progress
         decision, planner, info = r3jax.decide(planner, frame.T_world_camera, key)
-        page.decided(frame, decision)              # and where to go next
+        page.decided(frame, decision)              # where to go next
 
-It is served by the standard library, not by viser as the viewer's page: a robot or a headless
-machine that is scanned with needs no extra for it. It only answers: no request changes anything.
+Unlike the viewer's page, which needs viser, it is served by the standard library: robots and
+headless machines need no extra for it. It is read-only: no request changes anything.
 
 Shape symbols: N rows of the map; h, w image size; k places.
 """
@@ -51,12 +51,12 @@ _LATEST = 480
 
 
 class GuidePage:
-    """What the page shows. Calls may come from any thread."""
+    """Content of the page. Its methods may be called from any thread."""
 
     def __init__(self, url: str):
-        """Shows that it waits."""
+        """Shows that no frame has arrived yet."""
         self.url = url
-        """Where the page is."""
+        """URL of the page."""
         self._lock = threading.Lock()
         self._path: list[np.ndarray] = []
         self._pose, self._target = np.eye(4), list[np.ndarray]()
@@ -77,23 +77,23 @@ class GuidePage:
         self._tell(next=text, note=note, is_current=False)
 
     def forget(self) -> None:
-        """Forgets the path: poses were corrected, and all frames will come again."""
+        """Clears the path: poses were corrected, and all frames will be added again."""
         self._path, self._target = [], []
 
     def passed(self, frame: Frame) -> None:
-        """Takes note of a frame on the path that need not be shown, as others have come since."""
+        """Adds a frame to the path without showing it, as newer frames have arrived."""
         self._path.append(np.asarray(frame.T_world_camera, np.float64)[:3, 3])
 
     def observed(
         self, planner: Planner, frame: Frame, *, name: str = "", warnings: Iterable[str] = ()
     ) -> None:
-        """Shows what is known after a frame, and the way from it to where to go next.
+        """Shows the progress after a frame, and the directions from it to the next view.
 
         Args:
-            planner: has observed the frame.
-            frame: the latest one; z up, meters.
-            name: of the frame.
-            warnings: what is wrong with it, sentences.
+            planner: a planner that has observed the frame.
+            frame: the latest frame; z up, meters.
+            name: name of the frame.
+            warnings: its faults, one sentence each.
         """
         self._pose = np.asarray(frame.T_world_camera, np.float64)
         self._path.append(self._pose[:3, 3])
@@ -117,13 +117,13 @@ class GuidePage:
         """Shows where to go next.
 
         Args:
-            frame: whose camera goes there.
+            frame: the frame whose camera goes there.
             decision: None if there is no view to take.
         """
         if decision is None:
             self._target = []
             text = "Nothing new can be reached from here."
-            note = "Step back and look around; or end the scan."
+            note = "Step back and look around, or end the scan."
             self._tell(next=text, note=note, is_current=True, target=None, way=[])
             return
         self._target = [decision.T_world_camera]
@@ -137,10 +137,10 @@ class GuidePage:
         """Describes the path from the latest frame to the target."""
         target = self._target
         if not target:
-            return {"next": "Keep on scanning ...", "note": "looking for the best view",
+            return {"next": "Keep scanning ...", "note": "searching for the best view",
                     "is_current": False}  # fmt: skip
         words = ", ".join(steps_between(self._pose, target[0], meter=1.0))
-        note = "Seen from the latest picture. Go slowly; take pictures on the way."
+        note = "Directions start at the latest picture. Walk slowly and take pictures as you go."
         return {"next": f"{words[:1].upper()}{words[1:]}.", "note": note, "is_current": True}
 
     def answer(self, path: str) -> tuple[str, bytes] | None:
@@ -175,7 +175,7 @@ def open_guide(host: str = "127.0.0.1", port: int = 8080) -> Generator[GuidePage
         port: 0 takes any free one.
 
     Raises:
-        ValueError: no number of a port.
+        ValueError: the port is not a valid port number.
         OSError: the port is in use or not permitted, or the address is not one of this machine.
     """
     check_free(host, port)
@@ -204,7 +204,7 @@ class _Server(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Answers the page's questions."""
+    """Answers the page's requests."""
 
     def do_GET(self) -> None:
         """Sends the page, its news or a picture."""
@@ -224,48 +224,48 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(content)
 
     def _is_known_name(self, server: _Server) -> bool:
-        """False if somebody else's page asks, under a name that it has given this machine."""
+        """Returns False for requests under a foreign host name (DNS rebinding by another page)."""
         name = urlsplit(f"//{self.headers.get('Host', '')}").hostname
         return name in LOOPBACK or not server.is_private
 
     def log_message(self, format: str, *args: object) -> None:
-        """Says nothing on the console."""
+        """Logs nothing to the console."""
 
 
 _STANDPOINTS = AuditSettings.num_standpoints
-"""Standpoints from which surfaces are scored, as many as in an audit."""
+"""Number of standpoints from which surfaces are scored, as in an audit."""
 
 _HEADROOM = 0.35
 """As in `floor_picture` [m]."""
 
 _LEAST_DARK = 1.0
-"""Less needs no sentence [square meters]."""
+"""Minimum unseen area that is mentioned [square meters]."""
 
 _MARGIN = 0.6
-"""Shown round what is known [m]."""
+"""Margin shown around the known part [m]."""
 
 _COLORED = 0.75
-"""How much of the color of a surface on the plan is that of its renderability."""
+"""Opacity of the renderability color over a surface on the plan."""
 
 
 @dataclass(frozen=True)
 class ScanProgress:
-    """What is done."""
+    """Progress of a scan."""
 
     fine_share: float
     """Share of `seen_from` that is seen well enough."""
 
     seen_from: str
-    """What is evaluated, for the reader."""
+    """Description of the evaluated surface, for reports."""
 
     causes: dict[str, float]
-    """Share of the same of each other cause."""
+    """Share of each other cause in the evaluated surface."""
 
     area: float
-    """Area of all that, a voxel's face each [square meters]."""
+    """Area of the evaluated surface, counting one face of each voxel [square meters]."""
 
     dark: float
-    """Area where free space ends in something that no picture shows [square meters]."""
+    """Area of the boundary between free space and space that no picture shows [square meters]."""
 
     plan: np.ndarray
     """The place from above, surfaces from red to green, [h, w, 3] uint8; row 0 at the largest y."""
@@ -287,22 +287,22 @@ class ScanProgress:
         )
         rest = f"; seen {listed(parts)}." if parts else "."
         if self.dark >= _LEAST_DARK:
-            rest += f" About {self.dark:.0f} m² no picture shows yet (gray beside white)."
+            rest += f" No picture shows about {self.dark:.0f} m² yet (gray beside white)."
         end = " That is good for splats: you can stop here." if self.fine_share >= GOOD else ""
         return text + rest + end
 
 
 def scan_progress(planner: Planner, camera: Camera, places: np.ndarray) -> ScanProgress:
-    """Scores what was seen by the question of an audit, from fewer places.
+    """Scores the surfaces seen so far like an audit, from fewer places.
 
     Args:
-        planner: map and grid.
-        camera: would render.
-        places: where the camera was, [k, 3], k >= 1.
+        planner: provides map and grid.
+        camera: the rendering camera.
+        places: positions of the camera so far, [k, 3], k >= 1.
     """
     state = planner.map_state
     config = ScoringConfig(max_range=RANGE)
-    # As an audit does it: the camera was there, whatever the sensor says of places so near.
+    # As in an audit: the camera's own positions are free, even if the sensor reports otherwise.
     grid = free_round(planner.grid, places)
     num = AuditSettings.num_places
     stand = places_of(state, grid, places, num, is_dense=True, meter=1.0)
@@ -317,7 +317,7 @@ def scan_progress(planner: Planner, camera: Camera, places: np.ndarray) -> ScanP
 
 
 def _dark_area(grid: OccupancyGrid, places: np.ndarray) -> float:
-    """Measures where free space that can be reached ends in unseen space [square meters]."""
+    """Measures the area where reachable free space borders on unseen space [square meters]."""
     cell, reached = float(grid.cell_size), np.zeros(grid.log_odds.shape, dtype=bool)
     cells = np.floor((places - np.asarray(grid.origin)) / cell).astype(np.int64)
     reached[tuple(cells.clip(0, np.array(reached.shape) - 1).T)] = True
@@ -328,7 +328,7 @@ def _dark_area(grid: OccupancyGrid, places: np.ndarray) -> float:
 def _plan(
     planner: Planner, value: np.ndarray, places: np.ndarray
 ) -> tuple[np.ndarray, tuple[float, float, float, float]]:
-    """Draws the place from above, cut to the known part; also returns its extent."""
+    """Draws the place from above, cropped to the known part; also returns its extent."""
     height = float(np.median(places[:, 2]))
     picture, (left, right, bottom, _) = floor_picture(planner.map_state, planner.grid, height)
     pixel = (right - left) / picture.shape[1]
