@@ -121,7 +121,8 @@ def marks_of(picture: Picture, markdown: str) -> list[Marks]:
 
 def draw(picture: Picture, marks: list[Marks]) -> Figure:
     """Draws one line for each label, one color for each series, the first on top."""
-    labels, names = (list(dict.fromkeys(mark[at] for mark in marks)) for at in (0, 1))
+    labels = list(dict.fromkeys(mark.label for mark in marks))
+    names = list(dict.fromkeys(mark.series for mark in marks))
     step = {1: 0.5, 2: 0.3}.get(len(names), 0.22)
     figure = style.new_figure(8.0, 0.75 + len(labels) * (0.3 + 0.14 * len(names)))
     axes = style.dress(figure.subplots(), x=picture.axis)
