@@ -1,1 +1,1 @@
-"""Which frames of a capture to keep: those whose removal the surfaces would not miss."""
+"""Selects the frames of a capture to keep, so that its surfaces lose as little as possible."""

@@ -1,11 +1,12 @@
-"""Chooses frames one after the other, each for what it adds to the targets' renderability.
+"""Chooses frames one after another, each by its gain in the targets' renderability.
 
 Lazy greedy: R is not submodular (a direction that closes kappa's box is more useful after its
-counterpart), so that an old gain is no exact bound. `is_exact` evaluates every candidate before
-each choice; docs/howto/select.md says how often the two differ.
+counterpart), so that an old gain is not an exact bound. `is_exact` evaluates every candidate before
+each choice; docs/howto/select.md reports how often the results differ.
 
-The first frame and ties follow a rule and not the order of the frames: the largest gain; among
-equals the sharper frame, then the one nearer to the middle of the cameras, then the name.
+The first frame and ties follow a rule that does not depend on the order of the frames: the largest
+gain; among equals the sharper frame, then the one nearer to the center of the cameras, then the
+name.
 
 Shape symbols: n frames; k chosen; T targets.
 """
@@ -24,10 +25,10 @@ from r3jax.apps.select.targets import Targets
 from r3jax.planning.lazy_greedy import renew_best
 
 _AT_ONCE = 8
-"""Candidates that are evaluated together."""
+"""Number of candidates evaluated together."""
 
 _EQUAL = 1e-7
-"""Gains that differ by less of the larger one are equal: rounding depends on the order."""
+"""Relative difference below which gains are equal, as rounding depends on the order of sums."""
 
 
 @dataclass(frozen=True)
@@ -35,10 +36,10 @@ class Choice:
     """Frames in the order in which they were chosen."""
 
     order: np.ndarray
-    """Numbers of the frames, [k] int64."""
+    """Indices of the frames, [k] int64."""
 
     gain: np.ndarray
-    """What each added to the objective, [k]."""
+    """Gain of each frame when it was chosen, [k]."""
 
     per_target: np.ndarray
     """Renderability of each target after each frame, [k, T] float32."""
@@ -47,10 +48,10 @@ class Choice:
     """Renderability of each target after all frames, [T]."""
 
     left: np.ndarray
-    """What each frame would add at the end, [n]; 0 for those chosen."""
+    """Remaining gain of each frame at the end, [n]; 0 for those chosen."""
 
     is_complete: bool = True
-    """False where the choice was interrupted."""
+    """False if the selection was interrupted."""
 
     @property
     def objective(self) -> np.ndarray:
@@ -59,17 +60,17 @@ class Choice:
 
     @property
     def share(self) -> np.ndarray:
-        """The objective as a share of what all frames give, [k]."""
+        """The objective as a share of its value with all frames, [k]."""
         return self.objective / max(float(self.of_all.mean()), 1e-9)
 
 
 def tie_ranks(sharpness: np.ndarray, positions: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Ranks frames for ties, [n]: the lowest goes first.
+    """Ranks frames to break ties, [n]: the lowest rank wins.
 
     Args:
-        sharpness: the more the sharper, [n].
-        positions: of the cameras, [n, 3].
-        names: of the frames.
+        sharpness: larger is sharper, [n].
+        positions: camera positions, [n, 3].
+        names: names of the frames.
     """
     from_middle = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
     order = np.lexsort((np.argsort(np.argsort(names)), np.round(from_middle, 6), -sharpness))
@@ -93,13 +94,14 @@ def choose(
     """Chooses frames.
 
     Args:
-        observed: what every frame shows.
-        targets: whose renderability counts.
-        num: frames to choose at most, those to keep among them.
-        gain: share of what all allowed frames give, at which to stop; None: at `num`.
-        keep: frames that are chosen first, whatever they add.
+        observed: observations of every frame.
+        targets: views whose renderability counts.
+        num: maximum number of frames, including those to keep.
+        gain: share of the objective with all allowed frames at which to stop; None to stop at
+            `num`.
+        keep: frames that are chosen first, regardless of their gain.
         allowed: False for frames that may not be chosen, [n].
-        ranks: for ties, [n], see `tie_ranks`; None: the order of the frames.
+        ranks: tie-breaking ranks, [n], see `tie_ranks`; None: the order of the frames.
         is_exact: evaluate every candidate before each choice.
         on_choice: called after each frame; True ends the choice.
     """
@@ -141,10 +143,10 @@ def choose(
 
 
 def _best(bound: np.ndarray, is_new: np.ndarray, objective: Objective, ranks: np.ndarray) -> int:
-    """Finds the frame with the largest gain; among equals the one of the lowest rank."""
+    """Finds the frame with the largest gain; the lowest rank breaks ties."""
     while True:
         best = renew_best(bound, is_new, objective.gains, _AT_ONCE)
-        assert best is not None  # no more are chosen than may be
+        assert best is not None  # callers choose at most as many frames as are allowed
         equal = np.flatnonzero(bound >= bound[best] - _EQUAL * abs(bound[best]))
         stale = equal[~is_new[equal]]
         if not len(stale):
@@ -161,7 +163,7 @@ def _after(observed: Observed, targets: Targets, frames: np.ndarray) -> np.ndarr
 
 
 def component_of(observed: Observed) -> np.ndarray:
-    """Labels the scene of each frame, [n]: frames that a chain of common surfaces connects."""
+    """Labels the scene of each frame, [n]: frames connected by a chain of shared surfaces."""
     count = len(observed)
     first_of = np.full(observed.num_rows, -1, np.int64)  # the first frame that shows a row
     links: list[np.ndarray] = []
@@ -177,11 +179,11 @@ def component_of(observed: Observed) -> np.ndarray:
 
 
 def in_proportion(sizes: np.ndarray, num: int) -> np.ndarray:
-    """Splits a number into parts in proportion to sizes (largest remainders), none above its size.
+    """Splits a number in proportion to sizes (largest remainders), no part above its size.
 
     Args:
-        sizes: [g].
-        num: at most their sum.
+        sizes: upper limits of the parts, [g].
+        num: number to split, at most the sum of the sizes.
     """
     exact = num * sizes / max(int(sizes.sum()), 1)
     parts = np.floor(exact).astype(np.int64)
@@ -199,9 +201,9 @@ class _Quotas:
         self._left = in_proportion(sizes, min(num, int(sizes.sum())))
 
     def take(self, frame: int) -> None:
-        """Counts a frame that was chosen."""
+        """Counts a chosen frame."""
         self._left[self._component[frame]] -= 1
 
     def full(self) -> np.ndarray:
-        """Returns the frames that may not be chosen, since their scene has its share."""
+        """Returns the frames that may not be chosen because their scene has reached its quota."""
         return np.flatnonzero(self._left[self._component] <= 0)

@@ -1,19 +1,20 @@
-"""The objective: the mean renderability of targets, and what one more frame adds to it.
+"""Computes the objective, the mean renderability of targets, and the gain of one more frame.
 
-A frame observes rows of the map of all frames: a direction bin, a resolution, a color. With the
+A frame observes rows of the map of all frames: a direction bin, a resolution, a color. For the
 frames chosen so far a row has a count, a mean color, a spread and a best resolution; a pair of a
-row and a target that shows it has the nearest seen direction and the sides of kappa's box. All of
-them take another observation in constant time, so that a gain costs what the frame shows.
+row and a target that shows it has the nearest seen direction and the sides of kappa's box. Each of
+these is updated by another observation in constant time, so that computing a gain is linear in the
+number of observations of the frame.
 
 The value is that of `scoring.terms.score_voxels` on the map of just the frames chosen, times
 
     s^(delta b),   s the sharpness (1 / blur in pixels) of the sharpest frame that shows the row
 
-(`renderability_of` computes it that way). R asks for resolution where a view must interpolate,
-with the power 1 - delta b: at the very place of a frame it takes that frame for the truth. A
-blurred one is not; with this factor its blur counts in full from everywhere, until a sharp frame
-shows the same surface. `kernels.scoring.frame_gains` has the same in machine code, which is held
-to this.
+(`renderability_of` computes it that way). In R, resolution has the power 1 - delta b: it matters
+where a view must interpolate, but at the exact place of a frame that frame counts as ground truth.
+A blurred frame is not ground truth. With this factor its blur counts in full from everywhere, until
+a sharp frame shows the same surface. `kernels.scoring.frame_gains` is the same in machine code, and
+tests compare it with these formulas.
 
 Shape symbols: N rows; P pairs; T targets; n frames; m observations.
 """
@@ -38,15 +39,16 @@ _ALL_SIDES = 15
 
 
 class Objective:
-    """Mean renderability of targets while frames are added; the arrays change in place."""
+    """Mean renderability of targets, updated in place as frames are added."""
 
     def __init__(self, observed: Observed, targets: Targets, *, uses_kernel: bool | None = None):
-        """Nothing is chosen yet.
+        """Starts with no frame chosen.
 
         Args:
-            observed: what every frame shows.
-            targets: whose renderability counts.
-            uses_kernel: machine code, or the formula; None: machine code where there is any.
+            observed: observations of every frame.
+            targets: views whose renderability counts.
+            uses_kernel: True for machine code, False for the formula; None: machine code if
+                available.
         """
         num, pairs = observed.num_rows, len(targets.target)
         self._observed, self._targets = observed, targets
@@ -70,7 +72,7 @@ class Objective:
         return float(self._totals.mean())
 
     def gains(self, frames: np.ndarray) -> np.ndarray:
-        """Computes what each of some frames [c] would add to the value, [c]."""
+        """Computes the gain of each of some frames [c], [c]."""
         if self._uses_kernel:
             from r3jax.kernels.scoring import frame_gains
 
@@ -80,7 +82,7 @@ class Objective:
         return found / len(self._targets)
 
     def add(self, frame: int) -> None:
-        """Adds a frame to those chosen."""
+        """Adds a frame to the selection."""
         if self._uses_kernel:
             from r3jax.kernels.scoring import frame_gains
 
@@ -96,7 +98,7 @@ class Objective:
         self._totals += np.bincount(target, after.gain, len(self._targets))
 
     def _structs(self) -> tuple[Any, Any, Any, Any]:
-        """Returns the arrays as the kernel takes them."""
+        """Returns the arrays in the layout of the kernel."""
         from r3jax.kernels.scoring import frame_gains as kernel
 
         seen, to = self._observed, self._targets
@@ -188,7 +190,7 @@ def _value(
     ratio: np.ndarray,
     sharpness: np.ndarray,
 ) -> np.ndarray:
-    """Computes R of pairs (`scoring.terms`), and what blur leaves of it."""
+    """Computes R of pairs (`scoring.terms`), reduced by blur."""
     kappa = np.where(is_inside, 1.0, 2.0)
     bias = cosine**kappa
     near = delta * bias
@@ -196,9 +198,10 @@ def _value(
 
 
 def renderability_of(observed: Observed, targets: Targets, frames: Sequence[int]) -> np.ndarray:
-    """Computes the renderability of every target on the map of just some frames, [T].
+    """Computes the renderability of every target on the map of only some frames, [T].
 
-    By the formulas of the package, from nothing: what `Objective` brings up to date.
+    It uses the formulas of the package from scratch, and gives the value that `Objective` updates
+    incrementally.
     """
     state = observed.map_of(frames)
     sharp = np.zeros(observed.num_rows, np.float32)
@@ -219,7 +222,7 @@ def _values(
     position: Float[Array, "T 3"],
     focal: Float[Array, " T"],
 ) -> Float[Array, "T N"]:
-    """Computes R of every row from every target, and what blur leaves of it."""
+    """Computes R of every row from every target, reduced by blur."""
 
     def value(view: tuple[Array, Array]) -> Float[Array, " N"]:
         found = score_voxels(state, *view)

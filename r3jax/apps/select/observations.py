@@ -1,7 +1,7 @@
-"""What each frame of a capture says of the surfaces, on the rows of the map of all frames.
+"""Extracts the observations of each frame of a capture, on the rows of the map of all frames.
 
-    1. all frames join one map: now the surfaces are known;
-    2. each frame joins an empty map with the same rows: what it observes, alone.
+    1. all frames join one map, which gives the surfaces;
+    2. each frame joins an empty map with the same rows, which gives its own observations.
 
 Rows are numbered in the order of their keys, so that nothing depends on the order of the frames.
 
@@ -27,7 +27,7 @@ _CAPACITY = 1 << 15
 
 @dataclass(frozen=True)
 class Observed:
-    """What every frame observes, frame by frame."""
+    """Observations of all frames, frame by frame."""
 
     key: np.ndarray
     """Packed voxels of the rows, [2, N] uint32, ascending."""
@@ -39,7 +39,7 @@ class Observed:
     """Direction bins of a voxel."""
 
     first: np.ndarray
-    """First observation of each frame, and their number, [n + 1] int64."""
+    """Index of the first observation of each frame, then their total number, [n + 1] int64."""
 
     row: np.ndarray
     """[m] int32, ascending within a frame."""
@@ -54,10 +54,10 @@ class Observed:
     """Mean color of the frame's pixels, [m, 3] float32."""
 
     is_colored: np.ndarray
-    """False where no pixel fell into the voxel, which was seen anyway, [m]."""
+    """False if the voxel was seen but no pixel fell into it, [m]."""
 
     sharpness: np.ndarray
-    """Of each frame, in (0, 1]: 1 over the width of its blur [px], [n] float32."""
+    """Sharpness of each frame in (0, 1]: 1 over the width of its blur [px], [n] float32."""
 
     def __len__(self) -> int:
         """Returns the number of frames."""
@@ -117,13 +117,13 @@ def map_frames(
     """Builds the map of all surfaces.
 
     Args:
-        frames: one by one.
+        frames: the frames, one by one.
         voxel_size: edge of a voxel.
-        max_range: what is farther does not count.
-        drop_edges: False lets pixels on depth edges in.
+        max_range: surfaces farther than this do not count.
+        drop_edges: False to include pixels on depth edges.
 
     Raises:
-        ValueError: more voxels than any sensible voxel size would give.
+        ValueError: there are more voxels than with any reasonable voxel size.
     """
     whole = empty_map(_CAPACITY, voxel_size)
     for frame in frames:
@@ -138,13 +138,13 @@ def observe(
     join: Callable[[MapState, MapState, Frame], MapState],
     on_frame: Callable[[], None] = lambda: None,
 ) -> Observed:
-    """Finds what each frame says of the surfaces.
+    """Computes the observations of each frame.
 
     Args:
         whole: the map of all frames.
-        read: the frame with a number.
-        count: of the frames, n.
-        join: adds a frame to a map with the rows of another, that of all frames.
+        read: reads the frame with an index.
+        count: number of frames, n.
+        join: adds a frame to a map that has the rows of the map of all frames.
         on_frame: called after each frame.
     """
     key, occupied = np.asarray(whole.key), ordered_rows(whole)
@@ -169,7 +169,7 @@ def observe(
 
 
 def _joined(parts: list[np.ndarray]) -> np.ndarray:
-    """Concatenates the parts of a column and lets them go: long captures have gigabytes."""
+    """Concatenates the parts of a column and frees them, as long captures need gigabytes."""
     whole = np.concatenate(parts)
     parts.clear()
     return whole

@@ -1,10 +1,10 @@
-"""The reduced capture as a data set that other programs train on, and `selection.json`.
+"""Writes the reduced capture as a data set for other programs, and `selection.json`.
 
-A transforms.json and a COLMAP model stay what they are, with fewer frames: all other keys; the
-cameras, keypoints and points of the frames kept, with what remains of their tracks, in the form
-(binary or text) in which they were read. Of everything else a transforms.json is written, with
-depth in millimeters and the voxels as points. Pictures are links to the originals, or copies;
-nothing that belongs to the capture is written to.
+The format of a transforms.json or a COLMAP model is preserved, with fewer frames. A transforms.json
+keeps all other keys. A COLMAP model keeps the cameras, keypoints and points of the kept frames and
+the remaining parts of their tracks, in the form (binary or text) in which it was read. For every
+other format a transforms.json is written, with depth in millimeters and the voxels as points.
+Pictures are links to the originals, or copies; the capture itself is never modified.
 """
 
 import dataclasses
@@ -45,12 +45,12 @@ _PATHS = ("depth_file_path", "depth_path", "mask_path")
 """Files of a frame beside its picture."""
 
 _LARGEST_DEPTH = 65.0
-"""Millimeters of 16 bits end here [m]."""
+"""Largest depth in millimeters that fits into 16 bits [m]."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Written:
-    """What lies in the folder now."""
+    """Paths of the written files."""
 
     data_set: Path
     """The transforms.json, or the folder of the COLMAP model."""
@@ -70,15 +70,15 @@ def write_data_set(
     """Writes the reduced capture; an earlier selection in the folder is replaced.
 
     Args:
-        found: the frames kept.
-        capture: what was opened.
-        folder: ours.
+        found: the selection.
+        capture: the opened capture.
+        folder: output folder, made by r3jax.
         copies: copy the pictures instead of linking them.
         on_frame: called after each frame.
 
     Raises:
         FormatError, RunError: a picture is missing or broken.
-        OSError: the disk is full, not writable, ...
+        OSError: for example, the disk is full or not writable.
     """
     files = _Files(folder, copies)
     _clear(folder)
@@ -97,7 +97,7 @@ def write_data_set(
 
 
 def _clear(folder: Path) -> None:
-    """Deletes what an earlier selection has written, and nothing else."""
+    """Deletes the files that an earlier selection has written, and no others."""
     try:
         names = parse_json(read_bytes(folder / RECORD, _MAX_BYTES))["files"]
         patterns = [glob.escape(str(name)) for name in names]
@@ -107,7 +107,7 @@ def _clear(folder: Path) -> None:
 
 
 class _Files:
-    """Files of the data set, noted as they are written."""
+    """Files of the data set, recorded as they are written."""
 
     def __init__(self, folder: Path, copies: bool):
         self.folder, self._copies = folder, copies
@@ -125,7 +125,7 @@ class _Files:
         write_atomic(self.path(name), data)
 
     def take(self, name: str, original: Path) -> None:
-        """Links or copies a file of the capture; one that is missing stays missing."""
+        """Links or copies a file of the capture; a missing file is skipped."""
         if not original.is_file():
             return
         if self._copies or not place_link(self.path(name), original.resolve()):
@@ -143,7 +143,7 @@ def _reduce_transforms(
     files: _Files,
     on_frame: Callable[[], None],
 ) -> Path:
-    """Writes the file with fewer frames, and links what they name."""
+    """Writes the file with fewer frames, and links the files that they name."""
     content = parse_json(read_bytes(path, _MAX_BYTES))
     frames: list[dict[str, Any]] = [content["frames"][i] for i in kept.tolist()]
     for index, frame in zip(kept.tolist(), frames, strict=True):
@@ -277,7 +277,7 @@ def _write_transforms(
         frames.append(frame)
         on_frame()
     content: dict[str, Any] = {"depth_unit_scale_factor": 0.001, "frames": frames}
-    # nerfstudio looks for the model of the cameras beside the frames, not in them.
+    # nerfstudio expects the camera model at the top level, not in the frames.
     if len(models := {frame["camera_model"] for frame in frames}) == 1:
         content["camera_model"] = models.pop()
     points, colors = voxel_points(found.whole)

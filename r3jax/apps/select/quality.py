@@ -1,17 +1,17 @@
-"""How good the pictures are, in the terms of the formulas.
+"""Measures the quality of the pictures, as factors for the formulas.
 
-Blur. Detail that a frame shows, as a share of that of its neighbors (`captures.faults`), becomes
-the width of a blur, and the resolution of what the frame observes is divided by it; so is what a
-view sees that need not interpolate (`objective`). A blur of b
-pixels in all directions leaves about 1 / b^2 of the squared second differences: of pictures of two
-recordings that were blurred on purpose 0.27 and 0.48 (b = 2), 0.10 and 0.21 (3), 0.04 and 0.10 (4).
-Where all frames are blurred alike, neighbors do not tell, but the pictures do: halving an image of
-sharp edges leaves about two to four times the squared second differences, one of soft edges six to
-ten times (`fineness`, below 0.2 for a blur of 3 px in pictures of eight cameras, and 0.25 and more
-as they were taken).
+Blur. The detail of a frame relative to its neighbors (`captures.faults`) is converted to a blur
+width. The resolution of the frame's observations is divided by it, and so is the renderability of
+views that need not interpolate (`objective`). A blur of b pixels in all directions leaves about
+1 / b^2 of the squared second differences. In pictures of two recordings that were blurred on
+purpose it left 0.27 and 0.48 (b = 2), 0.10 and 0.21 (3), 0.04 and 0.10 (4). If all frames are
+equally blurred, neighbors do not reveal it, but the pictures themselves do: halving the size of an
+image with sharp edges multiplies the squared second differences by about two to four, with soft
+edges by six to ten (`fineness`, below 0.2 for a blur of 3 px in pictures of eight cameras, and 0.25
+and more in the originals).
 
 Exposure. The colors of a frame are divided by a gain for each channel, fitted to the mean colors of
-the surfaces; what contradicts the others after that lowers their consistency.
+the surfaces. Contradictions that remain lower the consistency.
 
 Shape symbols: n frames; m observations; N rows.
 """
@@ -29,52 +29,52 @@ from r3jax.captures.faults.blocks import BlockImage, overlaps
 from r3jax.captures.faults.faults import BLURRED
 
 _FEWEST = 40
-"""Surfaces shared with other frames below which no exposure is fitted."""
+"""Minimum number of surfaces shared with other frames to fit an exposure."""
 
 _MOST_COMPARED = 10_000_000
-"""Observations that gains are fitted to: of more, those of every second, third, ... surface."""
+"""Maximum number of observations used to fit gains; beyond it surfaces are subsampled."""
 
 _DARK, _BRIGHT = 0.05, 0.95
-"""Colors beyond these are clipped, or nearly, and say little of a gain."""
+"""Colors beyond these are clipped or nearly so, and are not used to fit a gain."""
 
 _ROUNDS = 8
-"""Rounds in which means of surfaces and gains of frames are brought up to date."""
+"""Iterations that alternate between the means of surfaces and the gains of frames."""
 
 _SOFT = 0.2
-"""Fineness below which a picture has no detail of a pixel's size."""
+"""Fineness below which a picture has no pixel-sized detail."""
 
 _SIDE, _EDGES, _PLAIN = 16, 95.0, 10.0
 """Blocks of pixels, and percentiles of their second differences: edges, and noise."""
 
 _ROUNDING = 0.5
-"""Second differences of next to nothing (of 255, squared)."""
+"""Negligible second differences (of 255, squared)."""
 
 _MOST_GAIN = 4.0
-"""Larger ones are a frame of something else."""
+"""Maximum plausible gain; larger ones mean that the frame shows something else."""
 
 
 @dataclass(frozen=True)
 class Quality:
-    """What is known of the pictures of frames."""
+    """Quality of the frames' pictures."""
 
     blur: np.ndarray
-    """Width of the blur beside that of the neighbors, at least 1, [n] [px]."""
+    """Width of the blur relative to the neighbors, at least 1, [n] [px]."""
 
     is_compared: np.ndarray
-    """False where no neighbors show the same surface, and blur is not known, [n]."""
+    """False if no neighbors show the same surface, so that blur is not known, [n]."""
 
     exposure: np.ndarray
-    """Gain of each channel over the others' frames, [n, 3]."""
+    """Gain of each channel relative to the other frames, [n, 3]."""
 
     twin_of: np.ndarray
-    """The sharper frame that each one repeats, [n] int64; -1: none."""
+    """Index of the sharper frame that each frame repeats, [n] int64; -1 for none."""
 
     fineness: np.ndarray
-    """Detail of the size of a pixel beside that of two, [n]; see `fineness`."""
+    """Ratio of detail at one pixel to that at two, [n]; see `fineness`."""
 
     @property
     def is_soft(self) -> bool:
-        """True if most pictures have no detail of a pixel's size: all are blurred, or enlarged."""
+        """True if most pictures have no pixel-sized detail: all are blurred or upscaled."""
         return bool(np.median(self.fineness) < _SOFT)
 
     @property
@@ -99,7 +99,7 @@ def fineness(rgb: np.ndarray) -> float:
 
 
 def _edges(image: np.ndarray, side: int) -> np.ndarray:
-    """Squared second differences across and down at edges, less those of noise, [2]."""
+    """Computes squared second differences across and down at edges, minus those of noise, [2]."""
     middle = 2.0 * image[1:-1, 1:-1]
     across = (image[1:-1, :-2] + image[1:-1, 2:] - middle) ** 2
     down = (image[:-2, 1:-1] + image[2:, 1:-1] - middle) ** 2
@@ -117,9 +117,9 @@ def quality_of(
     """Compares the frames of a capture.
 
     Args:
-        images: of the frames, [n].
-        fineness: of their pictures, [n].
-        observed: what they show.
+        images: block images of the frames, [n].
+        fineness: fineness of their pictures, [n].
+        observed: observations of the frames.
     """
     share = sharpness(images, overlaps(images)).share
     is_compared = np.isfinite(share)
@@ -143,9 +143,9 @@ def with_quality(observed: Observed, blur: np.ndarray, exposure: np.ndarray) -> 
     """Applies the frames' blur to their observations, and removes their exposure.
 
     Args:
-        observed: what the frames show.
-        blur: [n] [px].
-        exposure: [n, 3].
+        observed: observations of the frames.
+        blur: width of each frame's blur, [n] [px].
+        exposure: gains of each frame, [n, 3].
     """
     resolution, color = observed.resolution.copy(), observed.color.copy()
     for number, part in enumerate(map(slice, observed.first[:-1], observed.first[1:])):
@@ -158,8 +158,8 @@ def with_quality(observed: Observed, blur: np.ndarray, exposure: np.ndarray) -> 
 def exposures(observed: Observed) -> np.ndarray:
     """Fits a gain of each frame and channel to the mean colors of the surfaces, [n, 3].
 
-    The median over the surfaces, in turn with the means; gains of the median frame are 1. A frame
-    that shares few surfaces with others has 1.
+    The fit alternates between medians over the surfaces and the surfaces' means. The gains of the
+    median frame are 1, and so are those of frames that share few surfaces with others.
     """
     stride = max(1, -(-len(observed.row) // _MOST_COMPARED))
     used = observed.is_colored & (observed.row % stride == 0)

@@ -1,4 +1,4 @@
-"""One capture, of which some frames are kept: reading, comparing, choosing, and why not the others.
+"""Selects the frames of a capture to keep, and explains why the others are dropped.
 
 Shape symbols: n frames that can be read; T targets; k chosen.
 """
@@ -38,39 +38,40 @@ from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import poses_along
 
 STANDPOINTS, _DIRECTIONS = 24, 8
-"""Places from which views are targets, and level directions from each."""
+"""Number of places with target views, and of level directions at each."""
 
 _OUTSIDE = 0.05
-"""A target of which fewer pixels show anything lies outside of the capture."""
+"""Minimum share of a target's pixels that show the map; below it the target is outside of the
+capture."""
 
 _TWIN = (0.1, 8.0)
-"""A frame this near to a chosen one, in median depths, and turned by at most so much [deg], is its
-twin."""
+"""A frame within this distance of a chosen one, in median depths, and this angle [deg] is its
+near-duplicate ("twin")."""
 
 _SEVERAL = 0.02
-"""Scenes with a smaller share of the frames are frames beside the others, and not mentioned."""
+"""Minimum share of the frames for a scene to be reported as a scene."""
 
 Progress = Callable[[str, int], None]
-"""Called with the name of a stage and the number of its steps when it begins; and with an empty
-name after each step."""
+"""Progress callback: called with the name of a stage and its number of steps when the stage begins,
+and with an empty name after each step."""
 
 
 @dataclass(frozen=True)
 class Selected:
-    """Everything that a selection found. Poses are in the capture's coordinates."""
+    """Result of a selection. Poses are in the capture's coordinates."""
 
     source: Source
     survey: Survey
     settings: SelectSettings
     used: np.ndarray
-    """Numbers in the capture of the frames that were looked at, [n]."""
+    """Indices in the capture of the frames that were examined, [n]."""
 
     whole: MapState
-    """Map of all of them [audit units]."""
+    """Map of all these frames [audit units]."""
 
     quality: Quality
     choice: Choice
-    """Numbers in it count along `used`."""
+    """The selection; its frame indices refer to `used`."""
 
     targets: int
     """Number of targets T."""
@@ -79,14 +80,14 @@ class Selected:
     """Scene of each frame, [n]."""
 
     reasons: dict[int, str]
-    """Why frames were dropped, a few words, by their numbers in the capture."""
+    """Short reasons for dropped frames, by their indices in the capture."""
 
     notes: tuple[str, ...] = field(default=())
     """Notes for the user, in sentences."""
 
     @property
     def kept(self) -> np.ndarray:
-        """Numbers in the capture of the frames kept, ascending."""
+        """Indices in the capture of the frames kept, ascending."""
         return np.sort(self.used[self.choice.order])
 
 
@@ -98,19 +99,19 @@ def select(
     on_progress: Progress = lambda stage, steps: None,
     is_interrupted: Callable[[], bool] = lambda: False,
 ) -> Selected:
-    """Chooses the frames of a capture that are kept.
+    """Chooses the frames of a capture to keep.
 
     Args:
         source: the capture.
-        settings: how many, and for which targets.
-        capture: what was opened, in whose coordinates a camera path is.
-        on_progress: for a progress bar.
-        is_interrupted: asked after each choice; what was chosen so far is the result then.
+        settings: number of frames and targets.
+        capture: the opened capture, whose coordinates a camera path uses.
+        on_progress: progress callback.
+        is_interrupted: called after each choice; if True, the frames chosen so far are the result.
 
     Raises:
         ValueError: no two frames show the same surface; a name of a frame that does not exist; a
             camera path outside of the capture; nothing would be kept.
-        FormatError: fewer than two frames can be read, or nothing is said of depth.
+        FormatError: fewer than two frames can be read, or there is no source of depth.
         RunError: a file of a run is missing or broken.
         SceneFileError: the trained splat cannot be read.
     """
@@ -119,7 +120,7 @@ def select(
         source = source.with_depth(settings.depth_scale, is_along_ray=settings.depth_along_ray)
     source = with_surfaces(source, settings.surfaces, settings.model, on_progress)
     step = lambda: on_progress("", 1)
-    on_progress("looking at the capture", 0)
+    on_progress("examining the capture", 0)
     survey = survey_of(source, settings)
     on_progress("reading frames", len(survey.chosen))
     whole, images, fine, unread = _surfaces(source, survey, step)
@@ -133,8 +134,8 @@ def select(
     scenes = component_of(observed)
     if scenes.max() + 1 == len(used):
         raise InputError(
-            f"{source.name}: no two of its {len(used)} frames show the same surface, so there is "
-            "nothing to choose between: are the poses right?"
+            f"{source.name}: no two of its {len(used)} frames show the same surface, so frames "
+            "cannot be compared: check the poses"
         )
     on_progress("comparing frames", 0)
     quality = quality_of(images, fine, observed) if source.has_images else unknown_quality(observed)
@@ -172,7 +173,7 @@ def select(
 def _surfaces(
     source: Source, survey: Survey, on_frame: Callable[[], None]
 ) -> tuple[MapState, list[BlockImage], list[float], dict[int, FormatError]]:
-    """Maps all frames; returns also their pictures in blocks, their fineness, and unread frames."""
+    """Maps all frames; also returns their block images, their fineness, and unreadable frames."""
     images: list[BlockImage] = []
     fine: list[float] = []
     unread: dict[int, FormatError] = {}
@@ -194,7 +195,7 @@ def _surfaces(
 
 
 def _named(source: Source, used: np.ndarray, names: Sequence[str]) -> list[int]:
-    """Finds the numbers among `used` of frames by name, with or without their suffix."""
+    """Finds frames by name, with or without suffix, as indices into `used`."""
     found: list[int] = []
     for name in names:
         fits = [i for i, index in enumerate(used) if _is_named(source.labels[index], name)]
@@ -219,10 +220,10 @@ def _allowed(
     used: np.ndarray,
     keep: Sequence[int],
 ) -> tuple[np.ndarray, dict[int, str]]:
-    """Returns a mask of the frames that may be chosen, [n], and why the others may not.
+    """Returns a mask of the frames that may be chosen, [n], and reasons why the others may not.
 
     Raises:
-        ValueError: none may be.
+        ValueError: no frame may be chosen.
     """
     reasons: dict[int, str] = {}
     allowed = np.ones(len(used), dtype=bool)
@@ -239,8 +240,8 @@ def _allowed(
         reasons.pop(int(used[i]), None)
     if not allowed.any():
         raise InputError(
-            f"{source.name}: all {len(used)} frames are blurred, and none would be kept: leave "
-            "out --drop-blurred, or take the capture again"
+            f"{source.name}: all {len(used)} frames are blurred, so none would be kept: leave out "
+            "--drop-blurred, or repeat the capture"
         )
     return allowed, reasons
 
@@ -283,14 +284,14 @@ def _targets(
     targets = see_targets(whole, observed, cameras, poses, RANGE)
     if settings.targets != FRAMES and not (targets.coverage >= _OUTSIDE).any():
         raise InputError(
-            f"--targets {settings.targets}: its {len(targets)} views show nothing of the capture: "
-            "is the path in the capture's coordinates?"
+            f"--targets {settings.targets}: none of its {len(targets)} views shows the capture: "
+            "give a path in the capture's coordinates"
         )
     return targets
 
 
 def _reasons(found: Selected, known: dict[int, str]) -> dict[int, str]:
-    """Explains why each frame was not chosen, by its number in the capture."""
+    """Explains why each frame was not chosen, by its index in the capture."""
     source, used, quality = found.source, found.used, found.quality
     order = found.choice.order
     total = max(float(found.choice.of_all.mean()), 1e-9)
@@ -325,11 +326,11 @@ def _twin(found: Selected, frame: int) -> int | None:
 
 
 def _notes(found: Selected, targets: Targets, num_unread: int) -> tuple[str, ...]:
-    """What the user should know, sentences."""
+    """Writes notes for the user, one sentence each."""
     settings, used, notes = found.settings, found.used, list[str]()
     if settings.frames is not None and settings.frames > len(used):
         notes.append(
-            f"{settings.frames} frames are wanted, and the capture has {len(used)}: all are kept."
+            f"{settings.frames} frames were requested, the capture has {len(used)}: all are kept."
         )
     if num_unread:
         notes.append(f"{num_unread} frames cannot be read and are left out.")
@@ -344,23 +345,23 @@ def _notes(found: Selected, targets: Targets, num_unread: int) -> tuple[str, ...
         )
     if found.quality.is_soft:
         notes.append(
-            "All frames are blurred, or enlarged: hardly any of them has detail of the size of a "
-            "pixel. What is chosen is the best of them; only another capture would be sharper."
+            "All frames are blurred or upscaled: hardly any of them has pixel-sized detail. The "
+            "best of them are kept; only a new capture would be sharper."
         )
     blurred = found.quality.is_blurred
     if blurred[found.choice.order].any():
         notes.append(
-            f"{int(blurred[found.choice.order].sum())} of the frames kept are blurred: each added "
-            "more than any sharp one when it was chosen."
+            f"{int(blurred[found.choice.order].sum())} of the frames kept are blurred: each gained "
+            "more than any sharp frame when it was chosen."
         )
     outside = int((targets.coverage < _OUTSIDE).sum())
     if outside and settings.targets != FRAMES:
         notes.append(
-            f"{outside} of the {len(targets)} target views show next to nothing of the capture, "
-            "whatever is kept."
+            f"{outside} of the {len(targets)} target views show almost nothing of the capture, "
+            "regardless of the selection."
         )
     if not found.choice.is_complete:
-        notes.append("The choice was interrupted: the frames chosen so far are kept.")
+        notes.append("The selection was interrupted: the frames chosen so far are kept.")
     if found.source.remark:
         notes.append(found.source.remark)
     return tuple(notes)
@@ -380,27 +381,28 @@ def select_frames(
     max_range: float = 5.0,
     exact: bool = False,
 ) -> Choice:
-    """Chooses the frames that are enough to render some views well.
+    """Chooses frames that suffice to render the target views well.
 
-    Lazy greedy on the mean renderability of the targets; ties go to the sharper frame, and then to
-    the one nearer to the middle, so that the order of the frames does not matter.
+    It maximizes the mean renderability of the targets by lazy greedy selection. Ties go to the
+    sharper frame, and then to the one nearer to the center, so that the order of the frames does
+    not matter.
 
     Args:
         frames: posed images with depth; read twice, one by one.
-        num: frames to choose.
-        share: the same as a share of all.
-        gain: choose as many as it takes to reach this share of what all frames give. Without any
-            of the three: 0.95.
-        targets: `T_world_camera` of the views that count, [T, 4, 4]; None: the frames' own.
-        camera: of the targets; None: that of the first frame.
-        keep: numbers of frames that are chosen first.
-        blur: width of each frame's blur, [n] [px], 1 where it is sharp; None: all are.
+        num: number of frames to choose.
+        share: number of frames as a share of all frames.
+        gain: choose enough frames to reach this share of the renderability with all frames. The
+            default is 0.95 if none of the three is given.
+        targets: `T_world_camera` of the target views, [T, 4, 4]; None: the frames' own.
+        camera: camera of the targets; None: that of the first frame.
+        keep: indices of frames that are chosen first.
+        blur: width of each frame's blur, [n] [px], 1 for a sharp frame; None: all are sharp.
         voxel_size: edge of a voxel of the map [m].
         max_range: surfaces farther from a camera do not count [m].
         exact: evaluate every frame before each choice.
 
     Returns:
-        The order, what each frame adds, and the renderability of the targets after each.
+        The order, the gain of each frame, and the renderability of the targets after each.
 
     Raises:
         ValueError: no frames; settings that contradict each other; arrays that do not fit.

@@ -1,4 +1,4 @@
-"""The page of a selection: one HTML file that opens from disk, with everything inside."""
+"""Writes the page of a selection: one self-contained HTML file that opens from disk."""
 
 from pathlib import Path
 from typing import Any
@@ -16,34 +16,36 @@ from r3jax.plots.page import render
 from r3jax.plots.pictures import small_png
 
 _SHOWN = 12
-"""Thumbnails of a reason."""
+"""Maximum number of thumbnails for a reason."""
 
 _SIDE = 230
 """Longer side of a thumbnail [px]."""
 
 _KNEE = 0.95
-"""Share of what all frames give that the curve's knee is."""
+"""Share of the renderability with all frames that defines the knee of the curve."""
 
 _HEADROOM = 0.35
-"""What lies higher above the cameras is left out of the plan [audit units]."""
+"""Anything higher than this above the cameras is left out of the plan [audit units]."""
 
 _NUMBERED = 40
-"""With more frames their numbers would cover each other."""
+"""Maximum number of numbered frames, so that the numbers do not overlap."""
 
-_GROUPS = (("blurred", "Blurred"), ("twin", "Twins of a frame that is kept"),
+_GROUPS = (("blurred", "Blurred"), ("twin", "Near-duplicates of a kept frame"),
            ("adds", "Add little or nothing"), ("", "Left out"))  # fmt: skip
-"""How reasons begin, and the heading of those frames; the first that fits counts."""
+"""Beginning of a reason, and the heading of its frames; the first match counts."""
 
 _SURFACES = {
-    "depth": "Surfaces are those of the depth images.",
-    "stereo": "Surfaces are those of COLMAP's stereo depth maps; what they leave out is not known.",
+    "depth": "Surfaces come from the depth images.",
+    "stereo": "Surfaces come from COLMAP's stereo depth maps; where these have holes, the surface "
+    "is not known.",
     "sweep": "There are no depth images: depth was computed by comparing the photos with each "
-    "other (plane sweep); where they do not agree, nothing is known.",
-    "model": "Surfaces are those of the trained splat; what two images contradict is not known.",
+    "other (plane sweep); where they do not agree, the surface is not known.",
+    "model": "Surfaces come from the trained splat; parts that two images contradict are not "
+    "known.",
     "tracks": "There are no depth images: surfaces are the points of the structure from motion, "
-    "each as seen in its own pictures. What has no points counts as not shown.",
-    "cloud": "There are no depth images: surfaces are a cloud of points, of which nearer ones hide "
-    "those behind. What has no points counts as not shown.",
+    "each visible in the pictures of its track. Surfaces without points count as not shown.",
+    "cloud": "There are no depth images: surfaces are a point cloud, in which nearer points hide "
+    "those behind them. Surfaces without points count as not shown.",
 }
 
 
@@ -51,12 +53,12 @@ def write_page(found: Selected, folder: Path, written: Written) -> Path:
     """Writes `selection.html`.
 
     Args:
-        found: what was selected.
-        folder: a folder that exists.
+        found: the selection.
+        folder: an existing folder.
         written: the data set.
 
     Raises:
-        OSError: the disk is full, not writable, ...
+        OSError: for example, the disk is full or not writable.
     """
     page = render(
         "apps/select/selection_page.html",
@@ -69,7 +71,7 @@ def write_page(found: Selected, folder: Path, written: Written) -> Path:
         curve_note=_curve_note(found),
         plan=style.to_png(_plan(found)),
         dropped=_dropped(found),
-        dropped_note="Shares are of what all frames give.",
+        dropped_note="Shares refer to the mean renderability with all frames.",
         commands=commands(written),
         method=_method(found),
     )
@@ -83,8 +85,8 @@ def lead(found: Selected) -> list[str]:
     kept, total = len(found.choice.order), len(found.used)
     share = 100.0 * float(found.choice.share[-1])
     sentence = (
-        f"{kept} of {total} frames ({100 * kept / total:.0f} %) give {share:.0f} % of the mean "
-        "renderability that all of them give."
+        f"{kept} of {total} frames ({100 * kept / total:.0f} %) reach {share:.0f} % of the mean "
+        "renderability with all frames."
     )
     return [sentence]
 
@@ -109,7 +111,7 @@ def _cards(found: Selected) -> dict[str, str]:
     choice = found.choice
     cards = {
         f"of {len(found.used)} frames kept": str(len(choice.order)),
-        "of what all frames give": f"{100 * float(choice.share[-1]):.0f} %",
+        "of the mean R with all frames": f"{100 * float(choice.share[-1]):.0f} %",
         "mean R of the targets": f"{float(choice.objective[-1]):.2f}",
     }
     blurred = int(found.quality.is_blurred.sum())
@@ -119,7 +121,7 @@ def _cards(found: Selected) -> dict[str, str]:
 
 
 def knee(found: Selected) -> int | None:
-    """Returns the number of frames that give 95 % of what all give; None if more than are kept."""
+    """Returns the number of frames that reach 95 % of the mean R with all; None if not reached."""
     reached = np.flatnonzero(found.choice.share >= _KNEE)
     return int(reached[0]) + 1 if len(reached) else None
 
@@ -127,12 +129,12 @@ def knee(found: Selected) -> int | None:
 def _curve_note(found: Selected) -> str:
     number = knee(found)
     if number is None:
-        return "The frames kept give less than 95 % of what all frames give."
-    return f"{number} frames give 95 % of what all frames give."
+        return "The frames kept reach less than 95 % of the mean R with all frames."
+    return f"{number} frames reach 95 % of the mean R with all frames."
 
 
 def _curve(found: Selected) -> Figure:
-    """Draws the objective over the number of frames, with its knee and what all frames give."""
+    """Draws the objective over the number of frames, with its knee and the value of all frames."""
     choice = found.choice
     figure = style.new_figure(10.0, 3.6)
     axes = style.dress(figure.subplots(), x="frames kept", y="mean renderability of the targets")
@@ -193,7 +195,7 @@ def _plan(found: Selected) -> Figure:
 def _from_above(
     found: Selected, height: float
 ) -> tuple[np.ndarray, tuple[float, float, float, float]]:
-    """Returns the colors of the highest voxels below the cameras' heads, pale; and their extent."""
+    """Returns pale colors of the highest voxels below the cut above the cameras, and the extent."""
     state = found.whole
     there = np.asarray(state.occupied)
     center = np.asarray(state.center).T[there]
@@ -205,7 +207,7 @@ def _from_above(
     low, high = np.percentile(center[:, :2], [0.5, 99.5], axis=0)
     size = float(state.voxel_size)
     size *= max(1, round(float((high - low).max()) / 600.0 / size))
-    low = np.floor(low / size) * size  # pixels are voxels: none is missed by rounding
+    low = np.floor(low / size) * size  # align pixels with voxels, so that rounding misses none
     shape = np.maximum(np.ceil((high - low) / size).astype(int), 1)
     order = np.argsort(center[:, 2], kind="stable")  # the highest is painted last
     pixel = np.floor((center[order, :2] - low) / size).astype(int)
@@ -236,7 +238,7 @@ def _thumbnail(found: Selected, index: int, reason: str) -> dict[str, Any]:
     source = found.source
     try:
         rgb, _ = source.read(index)
-    except ValueError:  # why it cannot be read is the reason
+    except ValueError:  # the reason says why it cannot be read
         rgb = np.full((48, 64, 3), 200, np.uint8)
     up = found.survey.alignment.rotation.T @ [0.0, 0.0, 1.0]
     png = small_png(rgb, source.poses[index], up, _SIDE)
@@ -253,18 +255,19 @@ def _method(found: Selected) -> list[str]:
     voxel = found.survey.length(found.survey.voxel_size)
     texts = [
         _SURFACES[found.source.kind],
-        f"Targets: {targets}. Each frame is chosen for what it adds to their mean renderability R "
-        "on the map of the frames chosen before it (greedy; R of arXiv 2601.07484 from angle, "
+        f"Targets: {targets}. Each frame is chosen by its gain in their mean renderability R, on "
+        "the map of the frames chosen before it (greedy; R of arXiv 2601.07484 from angle, "
         "consistency and resolution).",
         f"Voxels of {voxel:.3g} {found.survey.unit}; images of at most 640 pixels.",
     ]
     if found.source.has_images:
         texts.append(
-            "Blur is measured beside the neighbors that show the same surface, and not known where "
-            f"all are blurred alike: {int(found.quality.is_compared.sum())} of {len(found.used)} "
+            "Blur is measured relative to neighbors that show the same surface, and is not known "
+            "where all are equally blurred: "
+            f"{int(found.quality.is_compared.sum())} of {len(found.used)} "
             "frames could be compared. The resolution of a frame is divided by the width of its "
             "blur. Exposure: a gain for each channel is fitted before colors are compared."
         )
     else:
-        texts.append("No pictures are there: nothing is known of blur and exposure.")
+        texts.append("The pictures are missing: blur and exposure are not known.")
     return texts

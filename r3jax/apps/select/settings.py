@@ -17,8 +17,7 @@ class SelectSettings(SurveySettings):
     """Settings that decide which frames are kept.
 
     Raises:
-        ValueError: a setting that makes no sense, or settings that contradict each other; names
-            the options.
+        ValueError: an invalid setting, or settings that contradict each other; names the options.
     """
 
     frames: int | None = None
@@ -28,15 +27,15 @@ class SelectSettings(SurveySettings):
     """Share of the frames to keep (0.2: one in five)."""
 
     gain: float | None = None
-    """Keep enough frames to reach this share of the renderability that all frames give; 0.95 if
-    neither --frames nor --share is given."""
+    """Keep enough frames to reach this share of the renderability with all frames; 0.95 if neither
+    --frames nor --share is given."""
 
     targets: str = FRAMES
     """Views to optimize for: `frames` (the capture's own), `stand` (wherever a person could stand),
     or a camera path (nerfstudio's camera_path.json, or any capture)."""
 
     keep: tuple[str, ...] = ()
-    """Names of frames to keep in any case."""
+    """Names of frames that are always kept."""
 
     drop_blurred: bool = False
     """Drop blurred frames. Without --frames, --share or --gain all other frames are kept."""

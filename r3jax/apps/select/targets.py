@@ -1,4 +1,4 @@
-"""The views whose renderability counts: which voxels they show, in which share of their pixels.
+"""Computes which voxels the target views show, and in which share of their pixels.
 
 Shape symbols: T targets; P pairs of a row and a target that shows it; N rows; h w buffer size.
 """
@@ -20,10 +20,10 @@ from r3jax.scoring.config import ScoringConfig
 from r3jax.visibility.views import pinhole_view
 
 BUFFER = 96
-"""Longer side of the images of the targets [px]: a tenth of a voxel's weight is not needed."""
+"""Longer side of the images of the targets [px]; weights need not be more precise."""
 
 _AT_ONCE = 32
-"""Targets that are drawn at once."""
+"""Number of targets drawn at once."""
 
 
 @dataclass(frozen=True)
@@ -37,13 +37,13 @@ class Targets:
     """Focal lengths of R, [T] float32 [px]."""
 
     first: np.ndarray
-    """First pair of each row, and the number of pairs, [N + 1] int64."""
+    """Index of the first pair of each row, then the number of pairs, [N + 1] int64."""
 
     target: np.ndarray
-    """[P] int32."""
+    """Index of the target of each pair, [P] int32."""
 
     weight: np.ndarray
-    """Share of the target's pixels that show the row, [P] float32; the rest is not known."""
+    """Share of the target's pixels that show the row, [P] float32; other pixels are not known."""
 
     def __len__(self) -> int:
         """Returns the number of targets."""
@@ -66,10 +66,10 @@ def see_targets(
 
     Args:
         whole: the map of all frames.
-        observed: what they observe, whose rows are numbered otherwise.
-        cameras: of the targets, [T].
+        observed: observations of the frames; they number the rows in another order.
+        cameras: cameras of the targets, [T].
         poses: `T_world_camera`, [T, 4, 4].
-        max_range: what is farther is not shown.
+        max_range: surfaces farther than this are not visible.
     """
     config = ScoringConfig(max_range=max_range, zbuffer_size=BUFFER)
     row_of = np.full(whole.capacity, -1, np.int64)

@@ -1,9 +1,9 @@
-"""Frames of a video before anything is known of its geometry: sharp ones, within equal motion.
+"""Extracts sharp frames from a video at intervals of equal image motion, without known geometry.
 
-How far the image moves from one frame to the next is measured by phase correlation (Kuglin and
-Hines 1975) of small gray images. The video is cut into stretches of equal motion, so that a camera
-that stands still leaves one frame and a fast turn many, and of each stretch the sharpest frame is
-kept, by the variance of the Laplacian: within a stretch frames show nearly the same.
+Image motion between frames is measured by phase correlation (Kuglin and Hines 1975) of small gray
+images. The video is cut into segments of equal motion, so that a camera at rest yields one frame
+and a fast turn many. The sharpest frame of each segment is kept, by the variance of the Laplacian,
+as frames within a segment show nearly the same.
 
 Shape symbols: n frames; k chosen; h w of the small images.
 """
@@ -21,16 +21,16 @@ from r3jax.formats.video import Video
 from r3jax.plots.pictures import png
 
 _ACROSS = 160
-"""Columns of the images whose motion is measured [px]."""
+"""Width of the images used to measure motion [px]."""
 
 _STILL = 0.002
-"""Motion that counts for nothing, as a share of the width: noise, and a hand that holds still."""
+"""Motion below this share of the width is ignored: noise, and the tremor of a hand at rest."""
 
 _PEAK = 8.0
-"""Standard deviations of the correlation that its peak stands out by: chance reaches five."""
+"""Minimum height of the correlation peak in standard deviations; noise reaches five."""
 
 _LOST = 0.35
-"""Motion of a pair of frames that have nothing in common, such as a cut."""
+"""Motion assigned to two frames without common content, as at a cut."""
 
 
 @dataclass(frozen=True)
@@ -38,10 +38,10 @@ class VideoFrames:
     """Frames of a video."""
 
     chosen: np.ndarray
-    """Numbers of the frames, [k], ascending."""
+    """Indices of the frames, [k], ascending."""
 
     motion: np.ndarray
-    """How far the image moved since the frame before, [n] [share of its width]."""
+    """Image motion since the previous frame, [n] [share of the width]."""
 
     sharpness: np.ndarray
     """Variance of the Laplacian, [n]."""
@@ -64,7 +64,7 @@ def shift_between(first: np.ndarray, second: np.ndarray) -> float:
     row, column = np.unravel_index(int(np.argmax(peaks)), peaks.shape)
     down = row if row <= first.shape[0] // 2 else row - first.shape[0]
     right = column if column <= first.shape[1] // 2 else column - first.shape[1]
-    # Noise has no peak: what is nowhere near one is another picture.
+    # Noise has no peak: without a clear one the images have nothing in common.
     is_same = float(peaks.max()) > _PEAK * float(peaks.std())
     return float(np.hypot(down, right)) / first.shape[1] if is_same else _LOST
 
@@ -74,7 +74,7 @@ def choose_from(images: Iterable[np.ndarray], num: int) -> VideoFrames:
 
     Args:
         images: colors [H, W, 3] uint8, in order.
-        num: frames wanted; fewer come of a video that has fewer.
+        num: number of frames; fewer if the video has fewer.
 
     Raises:
         ValueError: there is no frame.
@@ -92,18 +92,18 @@ def choose_from(images: Iterable[np.ndarray], num: int) -> VideoFrames:
 
 
 def sharpest_of_equal_motion(motion: np.ndarray, sharpness: np.ndarray, num: int) -> np.ndarray:
-    """Cuts a video into stretches of equal motion, and takes the sharpest frame of each.
+    """Cuts a video into segments of equal motion, and selects the sharpest frame of each.
 
     Args:
-        motion: since the frame before, [n].
-        sharpness: [n].
-        num: stretches; where the camera hardly moved, fewer.
+        motion: motion since the previous frame, [n].
+        sharpness: sharpness of each frame, [n].
+        num: number of segments; fewer if the camera hardly moved.
 
     Returns:
-        Numbers of the frames, ascending.
+        Indices of the frames, ascending.
     """
     num = min(num, len(motion))
-    # A little for every frame: of a camera that stands still frames are taken evenly.
+    # Add a little to every frame, so that a camera at rest is sampled evenly.
     path = np.cumsum(np.where(motion > _STILL, motion, 0.0) + 1e-6)
     stretch = np.minimum(
         (num * (path - path[0]) / (path[-1] - path[0] + 1e-9)).astype(int), num - 1
@@ -113,7 +113,7 @@ def sharpest_of_equal_motion(motion: np.ndarray, sharpness: np.ndarray, num: int
         for part in range(num)
         if len(own := np.flatnonzero(stretch == part))
     ]
-    # A fast turn skips stretches: the largest gaps that are left are halved.
+    # A fast turn skips segments: the largest remaining gaps are halved.
     while len(chosen) < num:
         rest = np.setdiff1d(np.arange(len(motion)), chosen)
         apart = np.abs(path[rest][:, None] - path[chosen][None]).min(axis=1)
@@ -127,20 +127,20 @@ def select_video(
     folder: Path,
     on_progress: Callable[[str, int], None] = lambda stage, steps: None,
 ) -> VideoFrames:
-    """Writes the chosen frames of a video as pictures, named by their numbers.
+    """Writes selected frames of a video as pictures, named by their numbers.
 
     Args:
         path: the video.
-        num: frames wanted.
-        folder: ours.
-        on_progress: for a progress bar.
+        num: number of frames.
+        folder: output folder, made by r3jax.
+        on_progress: progress callback.
 
     Raises:
         FormatError: PyAV is not installed, or the video is damaged.
-        OSError: the disk is full, not writable, ...
+        OSError: for example, the disk is full or not writable.
     """
     video = Video(path, path)
-    on_progress("looking at the video", len(video))
+    on_progress("analyzing the video", len(video))
 
     def images() -> Iterable[np.ndarray]:
         for number in range(len(video)):
