@@ -1,11 +1,11 @@
-"""From a capture's own coordinates to those in which it is audited, and back.
+"""Converts between a capture's own coordinates and those in which it is audited.
 
-The map, the free space and the standpoints need z up and lengths of a room's size; a capture has
-whatever its program gave it. A similarity leads from the one to the other:
+The map, the free space and the standpoints need z up and lengths on the scale of a room, while a
+capture has arbitrary coordinates. A similarity transforms one into the other:
 
     x_audit = scale * rotation @ (x_capture - origin)
 
-Everything that leaves the audit goes back through it.
+All output of the audit is transformed back.
 
 Shape symbols: n points or poses.
 """
@@ -22,16 +22,16 @@ AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 @dataclass(frozen=True)
 class Alignment:
-    """A similarity between two right-handed worlds."""
+    """A similarity between two right-handed coordinate systems."""
 
     rotation: np.ndarray
-    """Takes the capture's directions to the audit's, [3, 3] float64."""
+    """Rotation from the capture's directions to the audit's, [3, 3] float64."""
 
     scale: float
     """Length in the audit of one unit of the capture."""
 
     origin: np.ndarray
-    """Where the audit's origin lies in the capture, [3] float64."""
+    """The audit's origin in capture coordinates, [3] float64."""
 
     def points(self, points_capture: np.ndarray) -> np.ndarray:
         """Transforms points [n, 3] of the capture into the audit."""
@@ -62,10 +62,10 @@ def evenly_spaced(count: int, most: int) -> np.ndarray:
 
 
 def up_of(name: str) -> np.ndarray:
-    """Parses a direction: an axis' name, such as `y` or `-z`, or three numbers; a unit vector [3].
+    """Parses a direction, an axis such as `y` or `-z` or three numbers, as a unit vector [3].
 
     Raises:
-        ValueError: neither of them.
+        ValueError: the text is neither of these.
     """
     axis = name.removeprefix("-")
     if axis in AXES:

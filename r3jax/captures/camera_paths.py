@@ -1,12 +1,12 @@
-"""Camera paths in nerfstudio's two layouts, in a capture's own coordinates.
+"""Reads and writes camera paths in nerfstudio's two layouts, in a capture's own coordinates.
 
-    camera_path.json     what its viewer saves and `ns-render camera-path` reads
+    camera_path.json     saved by its viewer and read by `ns-render camera-path`
     transforms.json      frames with intrinsics, without images
 
-nerfstudio's viewer saves paths in the coordinates of its training, which by default are turned,
-centered and scaled. Where the training's dataparser_transforms.json lies beside the path, that is
-undone; else they are taken for the capture's own, as which nerfstudio trains if it is told to
-(`--orientation-method none --center-method none --auto-scale-poses False`).
+nerfstudio's viewer saves paths in the coordinates of its training, which are rotated, centered and
+scaled by default. If the training's dataparser_transforms.json lies beside the path, this is
+undone. Otherwise the coordinates are assumed to be the capture's own, in which nerfstudio trains
+with `--orientation-method none --center-method none --auto-scale-poses False`.
 """
 
 import json
@@ -33,14 +33,14 @@ _MAX_BYTES = 256 << 20
 """A pose takes some hundred bytes."""
 
 _LEAST_ANGLE = 0.01
-"""No lens has a narrower view [deg]."""
+"""Minimum plausible angle of view [deg]."""
 
 _FIELDS = {"camera_to_world": list[float], "fov": float}
 
 
 @dataclass(frozen=True)
 class CameraPath:
-    """Poses to be evaluated."""
+    """Poses to evaluate."""
 
     poses: np.ndarray
     """`T_world_camera`, [n, 4, 4] float64: OpenCV axes, the capture's own coordinates."""
@@ -64,8 +64,8 @@ def read_camera_path(path: Path) -> CameraPath:
     """Reads a camera_path.json.
 
     Raises:
-        FormatError: missing or damaged; not a perspective path; a pose that is not rigid, an angle
-            that is none.
+        FormatError: the file is missing or damaged, or not a perspective path; a pose is not rigid,
+            or an angle of view is invalid.
     """
     with naming(path):
         content = parse_json(read_bytes(path, _MAX_BYTES))
@@ -120,11 +120,11 @@ def write_camera_path(path: Path, poses: np.ndarray, camera: Camera, seconds: fl
     Args:
         path: the file.
         poses: `T_world_camera`, [n, 4, 4].
-        camera: of all poses; off-center principal points have no place in this layout.
-        seconds: that the path stays with each pose.
+        camera: camera of all poses; this layout cannot store off-center principal points.
+        seconds: time between two poses of the path.
 
     Raises:
-        OSError: the disk is full, not writable, ...
+        OSError: for example, the disk is full or not writable.
     """
     fov = 2.0 * math.degrees(math.atan(0.5 * camera.height / float(camera.fy)))
     aspect = camera.width / camera.height
@@ -145,7 +145,7 @@ def write_camera_path(path: Path, poses: np.ndarray, camera: Camera, seconds: fl
         "is_cycle": False,
         "smoothness_value": 0.0,
         "camera_path": cameras,
-        # What the viewer needs to show and change the path again.
+        # Fields that the viewer needs to show and edit the path.
         "keyframes": [
             {"matrix": c["camera_to_world"], "fov": fov, "aspect": aspect} for c in cameras
         ],
@@ -189,12 +189,12 @@ def path_of(path: Path, capture: object = None) -> CameraPath:
 
     Args:
         path: the file or folder.
-        capture: in whose coordinates they are to be; counts where a dataparser_transforms.json
-            lies beside a camera_path.json.
+        capture: the capture whose coordinates to use; matters if a dataparser_transforms.json lies
+            beside a camera_path.json.
 
     Raises:
-        FormatError: it is neither, or damaged.
-        RunError: it is a damaged run.
+        FormatError: the path is neither, or damaged.
+        RunError: the path is a damaged run.
     """
     if is_camera_path(path):
         found, normalization = read_camera_path(path), path.parent / NAME

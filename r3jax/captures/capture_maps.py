@@ -1,14 +1,14 @@
-"""What a capture has seen, as a map of all images and of all but some.
+"""Maps a capture for cross-validation: a map of all images, and one for each fold.
 
-An image must not be in the map that it is scored by. Maps cannot forget; so the images
-are dealt into folds, and every fold gets a map of its own over *the same rows*:
+An image must not be in the map on which it is scored, and frames cannot be removed from a map. The
+images are therefore divided into folds, and every fold gets its own map over *the same rows*:
 
-    1. all images join one map: now the surfaces are known;
-    2. each image joins the map of its fold, an empty one with the rows of the first.
-       What it looks at (`mark_seen`) is told by the surfaces of all images.
+    1. all images join one map, which gives the surfaces;
+    2. each image joins the map of its fold, which starts empty with the rows of the first map.
+       The surfaces of all images determine which voxels are in view (`mark_seen`).
 
-Maps with the same rows unite row by row, so the map without a fold is the union of the others. No
-result depends on the order of the images.
+Maps with the same rows are merged row by row, so the map without a fold is the union of the other
+folds. No result depends on the order of the images.
 
 Shape symbols: N rows; F folds.
 """
@@ -42,24 +42,24 @@ from r3jax.mapping.update import add_pixels, for_kernels, update_growing, with_r
 
 _CAPACITY = 1 << 15
 _MOST_ROWS = 1 << 22
-"""Beyond this the folds would not fit into memory."""
+"""Maximum number of rows, so that the folds fit into memory."""
 
 _SPARSE_REACH = 1.1
-"""An image without depth images looks this many times as far as its farthest point."""
+"""Without depth images, an image sees this many times as far as its farthest point."""
 
 OnFrame = Callable[[], None]
-"""Called after each image, twice for each."""
+"""Callback after each image; each image is processed twice."""
 
 
 @dataclass(frozen=True)
 class Seen:
-    """Everything that the images have seen."""
+    """Maps of everything that the images show."""
 
     state: MapState
     """Map of all images."""
 
     grid: OccupancyGrid
-    """Free and occupied space: by depth images, or by the rays to single points."""
+    """Free and occupied space, from depth images or from the rays to single points."""
 
     folds: tuple[MapState, ...]
     """Maps of the images of each fold, on the rows of `state`."""
@@ -77,13 +77,13 @@ def see(source: Source, survey: Survey, folds: int, on_frame: OnFrame = lambda: 
 
     Args:
         source: the images.
-        survey: which of them, and how fine.
-        folds: as many, or one for each image where there are fewer.
-        on_frame: for a progress bar.
+        survey: the images to use and the resolution.
+        folds: number of folds; with fewer images, one for each image.
+        on_frame: progress callback.
 
     Raises:
         FormatError, RunError: a file is missing or broken.
-        ValueError: more voxels than any sensible voxel size would give.
+        ValueError: there are more voxels than with any reasonable voxel size.
     """
     whole, grid = _surfaces(source, survey, on_frame)
     count = min(folds, len(survey.chosen))
@@ -108,7 +108,7 @@ def _surfaces(source: Source, survey: Survey, on_frame: OnFrame) -> tuple[MapSta
 
 
 def map_grid(source: Source, survey: Survey, numbers: np.ndarray) -> OccupancyGrid:
-    """Returns free and occupied space by some images, as `see` has it.
+    """Returns free and occupied space from some images, computed as in `see`.
 
     Raises:
         FormatError, RunError: a file is missing or broken.
@@ -129,29 +129,30 @@ _integrate_depth = jax.jit(integrate_depth)
 
 
 def _with_cameras(grid: OccupancyGrid, source: Source, survey: Survey) -> OccupancyGrid:
-    """Frees the places of the cameras, whatever the sensor says of places so near."""
+    """Marks the cameras' positions as free, regardless of the sensor, which is unreliable there."""
     return free_round(grid, survey.alignment.points(source.poses[survey.chosen, :3, 3]))
 
 
 _MOST_RAYS = 1000
-"""Rays of an image that mark free space."""
+"""Maximum number of rays of an image that mark free space."""
 
 _SAMPLES_PER_CELL = 4
-"""Samples of a ray in a cell's edge."""
+"""Number of ray samples per cell edge."""
 
 _LEAST_SAMPLES = 2
-"""A cell is passed by an image whose rays have this number of samples in it: half of its edge."""
+"""Minimum number of samples in a cell to count as passed by a ray: half of its edge."""
 
 
 def integrate_rays(grid: OccupancyGrid, eye: np.ndarray, points: np.ndarray) -> OccupancyGrid:
-    """Adds what an image says of space by single points: the rays to them are free.
+    """Marks free space along the rays from an image to single points.
 
-    Depth images ask the cells (`integrate_depth`); between single points most cells have no answer.
+    With depth images each cell is projected into the image (`integrate_depth`); between single
+    points most cells would have no measurement.
 
     Args:
         grid: the grid before.
         eye: the camera's center, [3] [audit units].
-        points: what it sees, [m, 3] [audit units].
+        points: the points that it sees, [m, 3] [audit units].
     """
     cell, shape = float(grid.cell_size), np.array(grid.log_odds.shape)
     if len(points) > _MOST_RAYS:
@@ -169,7 +170,7 @@ def integrate_rays(grid: OccupancyGrid, eye: np.ndarray, points: np.ndarray) -> 
         return (index[:, 0] * shape[1] + index[:, 1]) * shape[2] + index[:, 2]
 
     steps = np.arange(0.5 * cell / _SAMPLES_PER_CELL, RANGE, cell / _SAMPLES_PER_CELL)
-    # Short of the point by half a cell: there is its surface.
+    # Stop half a cell before the point, where its surface is.
     is_before = steps < length[:, None] - 0.5 * cell
     along = eye + (steps[:, None] / np.maximum(length, 1e-6)[:, None, None]) * offset[:, None, :]
     count = int(shape.prod())
@@ -182,7 +183,7 @@ def integrate_rays(grid: OccupancyGrid, eye: np.ndarray, points: np.ndarray) -> 
 
 
 _RAY_STEP = 1.4
-"""Log-odds of a look by single rays: one decides, as a depth image does from 5 m."""
+"""Log-odds of an observation by single rays: one is decisive, like a depth image from 5 m."""
 
 
 def _measured_points(frame: Frame) -> np.ndarray:
@@ -197,10 +198,10 @@ def _measured_points(frame: Frame) -> np.ndarray:
 
 
 def free_round(grid: OccupancyGrid, cameras: np.ndarray) -> OccupancyGrid:
-    """Marks the space round the cameras [n, 3] as free, a margin wide [audit units].
+    """Marks the space around the cameras [n, 3] as free, within the margin [audit units].
 
-    As `mark_free_ball` round each, in time of the cells near the cameras: a page that is live does
-    it with every frame.
+    It is equivalent to `mark_free_ball` around each, in time proportional to the cells near the
+    cameras, as a live page calls it for every frame.
     """
     origin, cell = np.asarray(grid.origin, np.float64), float(grid.cell_size)
     reach = np.arange(-int(np.ceil(MARGIN / cell)), int(np.ceil(MARGIN / cell)) + 1)
@@ -216,10 +217,10 @@ def free_round(grid: OccupancyGrid, cameras: np.ndarray) -> OccupancyGrid:
 
 
 def grown(state: MapState, frame: Frame, drop_edges: bool, max_range: float = RANGE) -> MapState:
-    """Returns the map with a frame's pixels, in a larger table where it needs one.
+    """Returns the map with a frame's pixels added, in a larger table if needed.
 
     Raises:
-        ValueError: more voxels than any sensible voxel size would give.
+        ValueError: there are more voxels than with any reasonable voxel size.
     """
     arguments = frame, jnp.float32(max_range), jnp.asarray(drop_edges)
     try:
@@ -252,13 +253,13 @@ def join_frame(part: MapState, whole: MapState, source: Source, frame: Frame) ->
     """Joins a frame of a capture to a map with the rows of all frames.
 
     Args:
-        part: the map that it joins.
+        part: the map to join.
         whole: the map of all frames, with the same rows.
         source: the capture.
         frame: the frame; its pixels have rows.
     """
     drop_edges = jnp.asarray(source.is_dense)
-    if source.kind == "tracks":  # a point was seen by the images of its track, and no other
+    if source.kind == "tracks":  # a point is seen only by the images of its track
         return _add_pixels(part, frame, jnp.float32(RANGE), drop_edges)
     reach = _reach(source, frame)
     return join_on_rows(part, whole, frame, reach, drop_edges, jnp.float32(RANGE))
@@ -273,18 +274,18 @@ def join_on_rows(
     drop_edges: Bool[Array, ""],
     max_range: Float[Array, ""],
 ) -> MapState:
-    """Joins a frame to a map with the rows of all frames, whose surfaces say what is in view.
+    """Joins a frame to a map with the rows of all frames, whose surfaces determine visibility.
 
     Args:
-        part: the map that it joins.
+        part: the map to join.
         whole: the map of all frames, with the same rows.
         frame: the frame; its pixels have rows.
-        reach: how far it looks [audit units].
-        drop_edges: False lets pixels on depth edges in.
+        reach: how far the frame sees [audit units].
+        drop_edges: False to include pixels on depth edges.
         max_range: pixels farther away do not count [audit units].
     """
     after = add_pixels(part, frame, max_range, drop_edges)
-    # A first measurement voids a row's marks, as its voxel may have been removed. None is here.
+    # A first measurement clears a row's marks, as its voxel may have been removed; not so here.
     marks = part.visited | after.visited, jnp.maximum(part.resolution, after.resolution)
     mark = by_platform(cpu=_mark_by_kernel, default=_mark_by_formula)
     return mark(eqx.tree_at(_marks, after, marks), whole, frame, reach)

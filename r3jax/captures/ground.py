@@ -1,10 +1,10 @@
-"""The floor that somebody walked on, and who stands where to hold a camera at a place.
+"""Finds the floor of a walked capture, and where a person can stand to hold a camera at a place.
 
-Free space over a sofa is no place to stand. The floor is what lies under the cameras; somebody
-stands where a body's cylinder, from the shin to the head, meets nothing, and reaches from there
-with an arm. A capture that no one walked through (a drone, a turntable, a robot) is told apart:
-there the floor is out of sight or too far below, or most of its own cameras would stand in
-something, and nothing is said of standing.
+Free space over a sofa is no place to stand. The floor is the surface below the cameras. A person
+can stand where a cylinder for the body, from shin to head, meets no obstacle, and can reach from
+there at arm's length. A capture that no one walked through (by drone, turntable or robot) is
+detected: its floor is not visible or too far below, or a person could not stand at most of its own
+cameras. Where a person could stand is then not known.
 
 Shape symbols: n cameras; m voxels; c places; X Y Z cells of the coarse grid.
 """
@@ -18,13 +18,13 @@ from scipy.spatial import KDTree
 from r3jax.mapping.occupancy import OccupancyGrid
 
 _WALKED = (0.5, 2.3)
-"""Median height of the cameras over the floor in a capture that somebody walked through [m]."""
+"""Range of the cameras' median height over the floor in a walked capture [m]."""
 
 _USUAL_HEIGHT = 1.5
-"""Taken as that height where the capture's unit is not known [m]."""
+"""Assumed height if the capture's unit is not known [m]."""
 
 _SHIN, _HEAD = 0.25, 1.8
-"""The body begins above the floor's own roughness, and ends at the head [m]."""
+"""Lower and upper end of the body over the floor: above its roughness, and at the head [m]."""
 
 _SHOULDERS = 0.25
 """Radius of the body [m]."""
@@ -33,27 +33,27 @@ _ARM = 0.6
 """How far to the side of the feet a camera can be held [m]."""
 
 _NEAR_CAMERAS = 16
-"""Cameras round a place that tell its floor."""
+"""Number of cameras around a place that determine its floor."""
 
 _FLOOR_PERCENTILE = 25.0
-"""Of what lies below these cameras: some were held over a table."""
+"""Percentile of the heights below these cameras; some were held over a table."""
 
 _KNOWN_BELOW = 0.2
-"""Share of the cameras below which something must be known."""
+"""Minimum share of the cameras with a known surface below."""
 
 _OWN_SHARE = 0.5
-"""Share of the capture's own cameras that must be where somebody could hold them."""
+"""Minimum share of the capture's own cameras at places where a person could hold them."""
 
 _STRAYS = 16
-"""Voxels in a body's cells that may be noise: 4 % of a square meter at 5 cm."""
+"""Maximum number of voxels in a body's cells that count as noise: 4 % of a square meter at 5 cm."""
 
 _FREE_SHARE = 0.5
-"""Share of a body's cells that must be known to be free; of the rest nothing is known."""
+"""Minimum share of a body's cells that are known to be free; the others may be unknown."""
 
 
 @dataclass(frozen=True)
 class Footing:
-    """Where somebody stands who holds the camera at each place."""
+    """Where a person stands to hold the camera at each place."""
 
     feet: np.ndarray
     """Points on the floor, [c, 3] [audit units]; NaN where no one can hold a camera there."""
@@ -63,12 +63,12 @@ class Footing:
 
     @property
     def is_reached(self) -> np.ndarray:
-        """True where somebody can hold a camera, [c]."""
+        """True where a person can hold a camera, [c]."""
         return np.isfinite(self.feet[:, 0])
 
 
 class Ground:
-    """The floor below a capture that somebody walked through."""
+    """The floor below a walked capture."""
 
     def __init__(
         self,
@@ -78,14 +78,14 @@ class Ground:
         levels: np.ndarray,
         person: float,
     ):
-        """Takes what `ground_of` found.
+        """Stores the results of `ground_of`.
 
         Args:
             grid: free and occupied space.
             voxels: centers of all voxels, [m, 3] [audit units].
-            cameras: with something known below them, [n, 3] [audit units].
-            levels: height of what is below each, [n] [audit units].
-            person: a meter of a person's size [audit units].
+            cameras: cameras with a known surface below, [n, 3] [audit units].
+            levels: height of the surface below each, [n] [audit units].
+            person: length of a meter for a person's size [audit units].
         """
         self._cell, self._origin = float(grid.cell_size), np.asarray(grid.origin, np.float64)
         shape = np.array(grid.log_odds.shape)
@@ -102,10 +102,10 @@ class Ground:
         self._grid = grid
         self._tree, self._levels, self._track = KDTree(cameras), levels, KDTree(cameras[:, :2])
         self.person = person
-        """A meter of a person's size [audit units]."""
+        """Length of a meter for a person's size [audit units]."""
 
     def floor(self, places: np.ndarray) -> np.ndarray:
-        """Height of the floor below each place, [c] [audit units]: that of the cameras round it."""
+        """Computes the floor height below places, [c] [audit units], from the cameras nearby."""
         count = min(_NEAR_CAMERAS, self._tree.n)
         near = np.asarray(self._tree.query(places, k=count)[1]).reshape(len(places), count)
         return np.percentile(self._levels[near], _FLOOR_PERCENTILE, axis=1)
@@ -137,7 +137,7 @@ class Ground:
         return [steps[i] for i in order.tolist() if 0.0 < length[i] <= reach + 1e-9]
 
     def _stands(self, places: np.ndarray, floor: np.ndarray) -> np.ndarray:
-        """True where a body under the camera meets nothing, [c]."""
+        """Returns a mask of places where a body under the camera meets no obstacle, [c]."""
         shape = np.array(self._grid.log_odds.shape)
         low = np.rint((floor + _SHIN * self.person - self._origin[2]) / self._cell)
         head = np.maximum(floor + _HEAD * self.person, places[:, 2])
@@ -162,7 +162,7 @@ class Ground:
             free += inside * of(self._free)
             held += inside * of(self._held)
             cells += high - low
-        # A chair's back fills no cell: voxels tell.
+        # The back of a chair fills no cell, so voxels are checked too.
         meets |= held > _STRAYS
         walked = self._track.query(places[:, :2])[0] <= _SHOULDERS * self.person
         return ~meets & (walked | (free >= _FREE_SHARE * cells))
@@ -171,13 +171,13 @@ class Ground:
 def ground_of(
     grid: OccupancyGrid, voxels: np.ndarray, cameras: np.ndarray, meter: float | None
 ) -> Ground | None:
-    """Finds the floor that somebody walked on; None: no one did, or it is not known.
+    """Finds the floor of a walked capture; None if no one walked there, or it is not known.
 
     Args:
         grid: free and occupied space.
-        voxels: centers of all voxels, [m, 3] [audit units]: finer than the grid.
-        cameras: where the camera was, [n, 3] [audit units].
-        meter: a meter [audit units]; None: the capture's unit is not known.
+        voxels: centers of all voxels, [m, 3] [audit units]; finer than the grid.
+        cameras: camera positions, [n, 3] [audit units].
+        meter: length of a meter [audit units]; None if the capture's unit is not known.
     """
     cell, origin = float(grid.cell_size), np.asarray(grid.origin, np.float64)
     occupied = np.asarray(grid.occupied)
@@ -202,7 +202,7 @@ def ground_of(
 def _refined(tops: np.ndarray, voxels: np.ndarray, cameras: np.ndarray, cell: float) -> np.ndarray:
     """Refines the height below each camera, [n], by the voxels in the cells that end at `tops`.
 
-    A cell is as high as a step of a staircase; a floor that fills two of them lies in the lower.
+    A cell is as high as a step of a staircase; a floor that spans two cells lies in the lower one.
     """
     found = tops.copy()
     columns = KDTree(voxels[:, :2]).query_ball_point(cameras[:, :2], 1.5 * cell)

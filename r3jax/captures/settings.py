@@ -13,10 +13,10 @@ Surfaces = Literal["auto", "depth", "sweep", "model", "points"]
 
 @dataclass(frozen=True)
 class SurveySettings:
-    """How a capture is read, and at which resolution it is mapped.
+    """Settings for reading a capture and for the resolution of its map.
 
     Raises:
-        ValueError: a setting that makes no sense; names the option.
+        ValueError: an invalid setting; names the option.
     """
 
     voxel_size: float | None = None
@@ -61,7 +61,7 @@ class SurveySettings:
             if value is not None and not 0.0 < value < math.inf:
                 raise InputError(f"--{name.replace('_', '-')} must be positive, got {value}")
         if self.surfaces == "model" and self.model is None:
-            raise InputError("--surfaces model takes a trained splat: give --model scene.ply")
+            raise InputError("--surfaces model needs a trained splat: give --model scene.ply")
         if self.model is not None and self.surfaces not in ("auto", "model"):
             raise InputError(f"--model and --surfaces {self.surfaces} exclude each other")
         at_least(self, {"max_frames": 2})

@@ -1,15 +1,15 @@
-"""Where somebody could hold a camera in a captured place, to take an image or to look around.
+"""Finds where a person could hold a camera in a captured place, to take an image or to look around.
 
-With depth images the places lie in known free space, a margin from everything that is not known to
-be free, connected to where the camera was, at heights at which it was held. Without, they lie
-within the hull of the camera's positions and a margin round it, a margin from every voxel, and
-where a camera was or a ray to a point passed: not inside of walls. Where the floor is known,
-somebody must be able to stand there, or to reach there with an arm.
+With depth images the places lie in known free space, at a margin from everything that is not known
+to be free, connected to the camera's positions, and at heights at which the camera was held.
+Without depth images, they lie within the hull of the camera's positions and a margin around it, at
+a margin from every voxel, and where a camera was or a ray to a point passed, so not inside walls.
+If the floor is known, a person must also be able to stand there, or to reach there at arm's length.
 
-Cameras that look inward, round an object on a table or a statue, say nothing of where people stand:
-there the places are the dome of the cameras round it.
+Cameras that look inward, around an object on a table or a statue, do not show where people stand.
+The places then form the dome of the cameras around it.
 
-Shape symbols: n cameras; m voxels; c places; p places that are chosen.
+Shape symbols: n cameras; m voxels; c places; p chosen places.
 """
 
 from dataclasses import dataclass
@@ -30,44 +30,45 @@ _HEIGHTS = (5.0, 95.0)
 """Percentiles of the cameras' heights between which people hold them."""
 
 _MOST_LATTICE = 40_000
-"""Places between which the hull's are chosen."""
+"""Number of candidate places in the hull."""
 
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
 
 
 _FEWEST = 24
-"""With fewer places in free space, those where the camera was are taken, too."""
+"""With fewer places in free space, the camera's own positions are added."""
 
 _OVER = 4
-"""At most one place in this many is only reached with an arm."""
+"""At most one in this number of places is reached only at arm's length."""
 
 
 @dataclass(frozen=True)
 class Places:
-    """Where views are looked for, each far from those before it; standing room first."""
+    """Places that are searched for views, each far from those before it; standing places first."""
 
     eyes: np.ndarray
     """Positions of the camera, [p, 3] [audit units]."""
 
     feet: np.ndarray
-    """Where one stands to hold it there, [p, 3] [audit units]; NaN: not known."""
+    """Where a person stands to hold the camera there, [p, 3] [audit units]; NaN if not known."""
 
     num_standing: int
-    """As many, the first ones, are over one's feet; the others are reached with an arm."""
+    """Number of places above the person's feet, which come first; the others are reached at arm's
+    length."""
 
     is_checked: bool
-    """False if the floor is not known: then nothing is said of standing."""
+    """False if the floor is not known: then standing was not checked."""
 
     @property
     def seen_from(self) -> str:
-        """What is evaluated from here, for the reader."""
+        """Description of the surface evaluated from here, for reports."""
         if self.is_checked:
             return "the surface visible from where a person could stand"
         return "the surface visible from around the cameras"
 
     @property
     def standing(self) -> np.ndarray:
-        """Places over one's feet, [q, 3]; all of them where the floor is not known."""
+        """Places above the person's feet, [q, 3]; all places if the floor is not known."""
         return self.eyes[: self.num_standing]
 
 
@@ -81,19 +82,19 @@ def places_of(
     meter: float | None,
     center: np.ndarray | None = None,
 ) -> Places:
-    """Spreads places where somebody could hold a camera.
+    """Spreads places where a person could hold a camera.
 
     Args:
         state: the map of the capture.
         grid: free and occupied space.
-        cameras: where the camera was, [n, 3] [audit units].
-        num: places at most.
-        is_dense: True if depth images say where space is free.
-        meter: a meter [audit units]; None: the capture's unit is not known.
-        center: middle of an object that the cameras look at from round it; None: they do not.
+        cameras: camera positions, [n, 3] [audit units].
+        num: maximum number of places.
+        is_dense: True if depth images show where space is free.
+        meter: length of a meter [audit units]; None if the capture's unit is not known.
+        center: center of an object that the cameras surround; None if there is none.
 
     Returns:
-        Places in known free space; where there are few, those of the cameras, too.
+        Places in known free space; if there are few, also the cameras' own positions.
     """
     voxels = np.asarray(state.center, np.float64).T[np.asarray(state.occupied)]
     if center is not None:
@@ -122,27 +123,27 @@ def places_of(
 
 
 _INWARD = 0.85
-"""Share of the cameras that must look at the middle of an object."""
+"""Minimum share of the cameras that look at the center of an object."""
 
 _ASIDE = 0.35
-"""A camera looks at the middle if its axis passes it within this share of its distance."""
+"""A camera looks at the center if its axis passes within this share of its distance."""
 
 _AROUND = 60.0
-"""Two cameras at least look at it from directions so far apart [deg]."""
+"""Minimum angle between the directions of at least two cameras [deg]."""
 
 _WITHIN = 0.7
-"""Half of what is seen lies within this share of the cameras' distance from the middle."""
+"""Half of the points seen lie within this share of the cameras' distance from the center."""
 
 _DOME = 400
-"""Directions of the dome between which places are chosen."""
+"""Number of candidate directions on the dome."""
 
 
 def inward_center(poses: np.ndarray, points: np.ndarray) -> np.ndarray | None:
-    """Finds the middle of an object that cameras look at from round it, [3]; None: they do not.
+    """Finds the center of an object that the cameras surround, [3]; None if there is none.
 
     Args:
         poses: `T_world_camera`, [n, 4, 4].
-        points: surfaces, [m, 3] in the same world.
+        points: points on surfaces, [m, 3] in the same coordinates.
     """
     eye, axis = poses[:, :3, 3], poses[:, :3, 2]
     # The point nearest to all axes: sum of (1 - a a^T) (c - eye) = 0.
@@ -165,11 +166,11 @@ def inward_center(poses: np.ndarray, points: np.ndarray) -> np.ndarray | None:
 
 
 def places_on_dome(cameras: np.ndarray, center: np.ndarray, voxels: np.ndarray) -> np.ndarray:
-    """Lists places round an object at the distance of its cameras, not below the lowest, [c, 3].
+    """Lists places around an object at the distance of its cameras, not below the lowest, [c, 3].
 
     Args:
-        cameras: where the camera was, [n, 3] [audit units].
-        center: middle of the object, [3].
+        cameras: camera positions, [n, 3] [audit units].
+        center: center of the object, [3].
         voxels: centers of all voxels, [m, 3], m >= 1.
     """
     offset = cameras - center
@@ -187,7 +188,7 @@ def places_in_free_space(grid: OccupancyGrid, cameras: np.ndarray) -> np.ndarray
 
     Args:
         grid: free and occupied space.
-        cameras: where the camera was, [n, 3] [audit units].
+        cameras: camera positions, [n, 3] [audit units].
     """
     cell = float(grid.cell_size)
     safe = safe_cells(np.asarray(grid.free), cell, MARGIN)
@@ -197,7 +198,7 @@ def places_in_free_space(grid: OccupancyGrid, cameras: np.ndarray) -> np.ndarray
     if not len(cells):
         return np.zeros((0, 3))
     centers = centers_on_host(grid, cells)
-    # A camera near a wall stands in a cell that is not safe: the nearest safe one is meant.
+    # A camera near a wall is in a cell that is not safe: use the nearest safe cell.
     distance, nearest = KDTree(centers).query(cameras)
     close = cells[np.asarray(nearest)[np.asarray(distance) <= 2.0 * MARGIN + cell]]
     if not len(close):
@@ -212,10 +213,10 @@ def places_in_hull(cameras: np.ndarray, voxels: np.ndarray) -> np.ndarray:
     """Finds places between the cameras, away from all voxels, [c, 3] [audit units].
 
     Args:
-        cameras: where the camera was, [n, 3].
+        cameras: camera positions, [n, 3].
         voxels: centers of all voxels, [m, 3], m >= 1.
     """
-    # The hull of boxes round the cameras is the hull and its margin, and never flat.
+    # The hull of boxes around the cameras includes the margin and is never flat.
     boxes = (cameras[:, None, :] + MARGIN * _CORNERS).reshape(-1, 3)
     low, high = boxes.min(axis=0), boxes.max(axis=0)
     spacing = max(0.5 * MARGIN, float(np.cbrt(np.prod(high - low) / _MOST_LATTICE)))
