@@ -1,10 +1,11 @@
-"""Do depth images and poses tell of one world? And if not, which common mistake would explain it?
+"""Checks whether depth images and poses agree, and finds the common mistake that would explain it.
 
-A mistake shows without knowing any room: a point of one depth image is where another one sees a
-surface, unless something hides it. With a wrong unit, a wrong focal length, or depth along the ray
-in place of z, it is elsewhere. So every mistake of `MISTAKES` is undone, with every value that it
-may have, and the images are compared again. The one that brings most points together is named, if
-it explains the contradiction clearly. (For the unit that is the scale of monocular reconstruction.)
+Mistakes can be detected without knowing the room: a point of one depth image must lie on a surface
+seen by another, unless it is occluded. With a wrong unit, a wrong focal length, or depth along the
+ray instead of z, it lies elsewhere. Each mistake in `MISTAKES` is therefore undone, with each of
+its possible values, and the images are compared again. The mistake whose correction makes most
+points agree is reported, if it clearly explains the contradiction. (A wrong unit is equivalent to
+the unknown scale of monocular reconstruction.)
 
 Shape symbols: n points; h, w size of an image.
 """
@@ -21,13 +22,13 @@ from r3jax.errors import InputError
 from r3jax.geometry.cameras import Camera
 
 _TOLERANCE = 0.05
-"""Surfaces that lie so close agree, as a share of their distance: noise, edges, drift of poses."""
+"""Surfaces this close agree, as a share of their distance: noise, edges, drift of poses."""
 
 _POINTS, _PICTURES, _SIDE = 100, 24, 160
 """Points of each image, images, and pixels along the longer side: 50,000 comparisons."""
 
 _FEWEST_POINTS = 400
-"""Fewer comparisons say nothing: the images hardly overlap."""
+"""Minimum number of comparisons; with fewer, the images hardly overlap."""
 
 _SEE_THROUGH_RATIO = 0.8
 """Points that others look through, for each that they see: 0.01 to 0.03 in good captures, 0.4 if
@@ -39,10 +40,10 @@ this must be. Where the cameras are right no mistake adds more than 0.03, with n
 depth, 5 mm and 0.3 degrees; a focal length 1.25 times too long takes 0.2 to 0.4 of 0.65 to 0.94."""
 
 _CLIMBS = 4
-"""Times that a size is varied by each step."""
+"""Number of refinements of a size for each step."""
 
 _SIMPLER = 0.03
-"""A mistake further down the list must explain so much more than one before it."""
+"""Margin by which a mistake further down the list must explain more than one before it."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class DepthImage:
     """`T_world_camera`, [4, 4] float64, in the unit of the depth."""
 
     def points(self, most: int, rng: np.random.Generator) -> np.ndarray:
-        """Draws some of the points that the depth image shows, in the camera's frame, [n, 3]."""
+        """Samples points of the depth image, in the camera's frame, [n, 3]."""
         return _points(self.depth, _lens_of(self.camera), most, rng)
 
 
@@ -108,20 +109,20 @@ def _coarser(images: Sequence[DepthImage]) -> list[_Image]:
 
 
 class _Agreement(NamedTuple):
-    """How images agree."""
+    """Agreement between images."""
 
     compared: int
-    """Points of one image that lie within another one where that has a depth."""
+    """Number of points of one image that fall within another one where that has a depth."""
 
     there: float
-    """Share of them that lie where the other one sees a surface."""
+    """Share of them that lie on a surface seen by the other image."""
 
     through: float
-    """Share of them that the other one looks through."""
+    """Share of them that the other image sees through."""
 
     @property
     def score(self) -> float:
-        """What speaks for them, less what speaks against: at most 1; hidden points do neither."""
+        """Evidence for agreement less evidence against it, at most 1; hidden points are neutral."""
         return self.there - self.through
 
 
@@ -133,22 +134,22 @@ class Mistake:
     """A common mistake."""
 
     undo: _Undo
-    """The image as it would be without the mistake, of some size."""
+    """Returns the image as it would be without the mistake of a given size."""
 
     values: np.ndarray
     """Sizes that are tried, [k, d]."""
 
     steps: tuple[float, ...]
-    """By which the best of these is varied."""
+    """Steps by which the best of these is varied."""
 
     is_small: Callable[[np.ndarray], bool]
     """True for sizes that an audit survives; a finding on the page says so then."""
 
     fits: str
-    """What would have to be done to the capture, to follow *if*; may name its size."""
+    """Correction of the capture, to follow *if*; may contain the size."""
 
     todo: str
-    """What to look at, or the option that helps."""
+    """What to check, or the option that helps."""
 
 
 def _flipped(rows: int, columns: int) -> _Undo:
@@ -188,7 +189,7 @@ def _never_small(size: np.ndarray) -> bool:
 
 
 def _either_or(undo: _Undo, fits: str, todo: str) -> Mistake:
-    """Makes a mistake that has no size."""
+    """Creates a mistake without a size."""
     return Mistake(undo, np.zeros((1, 1)), (), _never_small, fits, todo)
 
 
@@ -259,14 +260,13 @@ MISTAKES = (
         "convert them: they hold disparity",
     ),
 )
-"""Tried in this order."""
+"""The mistakes, in the order in which they are tried."""
 
 
 def check_agreement(images: Sequence[DepthImage]) -> None:
     """Refuses depth images that contradict the poses, or each other.
 
-    Nothing is said where images do not overlap, or were taken from one place: no depth is wrong
-    there.
+    Images that do not overlap, or were taken from one place, are accepted: no depth is wrong there.
 
     Raises:
         ValueError: a common mistake explains them far better; or nearly as many points lie where
@@ -297,7 +297,7 @@ def check_agreement(images: Sequence[DepthImage]) -> None:
 def _explained(
     pictures: list[_Image], found: _Agreement
 ) -> tuple[Mistake, np.ndarray, _Agreement] | None:
-    """Finds the mistake that clearly explains a contradiction, its size, and the agreement left."""
+    """Finds the mistake that clearly explains a contradiction, its size, and the new agreement."""
     best: tuple[Mistake, np.ndarray, _Agreement] | None = None
     overlaps = found.compared >= _FEWEST_POINTS
     score = found.score if overlaps else 0.0
@@ -328,7 +328,7 @@ def _tried(
 
 
 def _compared(images: Sequence[_Image]) -> _Agreement:
-    """Compares images, each with every other one."""
+    """Compares each image with every other one."""
     rng = np.random.default_rng(0)
     poses = np.stack([image.pose for image in images])
     lens = np.stack([image.lens for image in images]).T[:, :, None]

@@ -1,11 +1,11 @@
-"""Surfaces of a capture without a depth camera, from the best that there is.
+"""Finds the surfaces of a capture without a depth camera, from the best available source.
 
-    stereo    COLMAP's depth maps, where they lie beside the images
+    stereo    COLMAP's depth maps, if they lie beside the images
     sweep     a plane sweep at the poses (`captures.sweep`), by default
     model     depth rendered from a trained splat
     points    the sparse points alone
 
-Each says less than a depth camera does, and what it does not say is not known.
+Each gives less than a depth camera; surfaces that it does not give are not known.
 
 Shape symbols: n images; h, w size of an image; k points.
 """
@@ -26,19 +26,19 @@ from r3jax.splatting.ply import read_scene
 from r3jax.splatting.render import render
 
 _SWEPT_SIDE = 384
-"""Photos are thinned until their longer side has no more pixels: a voxel is no finer."""
+"""Photos are subsampled to at most this many pixels on the longer side; voxels are no finer."""
 
 _FEWEST_PHOTOS = 3
-"""Depth takes an image and two others that agree."""
+"""Minimum number of photos: depth needs an image and two others that agree."""
 
 _LEAST_KEPT = 0.1
-"""A sweep that keeps a smaller share of the pixels has failed: the poses or the lens are wrong."""
+"""Minimum share of pixels that a successful sweep keeps; below it poses or lens are wrong."""
 
 _CONTRADICTED = 0.1
-"""As has one that lies off the points by more than this share of their depth, in the median."""
+"""Maximum median deviation of a successful sweep from the points, as a share of their depth."""
 
 Progress = Callable[[str, int], None]
-"""As in `apps.audit`: a stage and its steps, then an empty name after each step."""
+"""Progress callback, as in `apps.audit`: a stage and its steps, then an empty name per step."""
 
 
 def with_surfaces(
@@ -47,17 +47,17 @@ def with_surfaces(
     model: Path | None = None,
     on_progress: Progress = lambda stage, steps: None,
 ) -> Source:
-    """Gives a capture the best surfaces that it can have, or those that are wanted.
+    """Adds surfaces to a capture, from the best available source or the requested one.
 
     Args:
-        source: the capture as it was opened.
-        wanted: `auto` sweeps where there is no depth, and keeps the points where that fails.
-        model: a trained splat in the capture's coordinates, whose depth is taken instead.
-        on_progress: for a progress bar.
+        source: the opened capture.
+        wanted: `auto` sweeps if there is no depth, and keeps the points if that fails.
+        model: a trained splat in the capture's coordinates, whose depth is used instead.
+        on_progress: progress callback.
 
     Raises:
-        InputError: what is wanted cannot be had.
-        FormatError: an image that is missing or broken.
+        InputError: the requested source is not available.
+        FormatError: an image is missing or broken.
         SceneFileError: the splat cannot be read.
     """
     if model is not None:
@@ -88,36 +88,36 @@ def _remarked(source: Source, why: str) -> Source:
 
 def _why_not_swept(source: Source) -> str | None:
     if source.photograph is None:
-        return "the pictures are not there"
+        return "the pictures are missing"
     if source.is_dense:
-        return "it has depth images already"
+        return "it already has depth images"
     if len(source) < _FEWEST_PHOTOS:
         return f"at least {_FEWEST_PHOTOS} pictures are needed, found {len(source)}"
     return None
 
 
 _OPAQUE = 0.8
-"""Opacity from which on a splat's pixel has a depth."""
+"""Minimum opacity for a pixel of a rendered splat to have a depth."""
 
 _COVERED = 0.3
-"""A splat that covers less of the pictures on average is of another place or scale."""
+"""Minimum mean coverage of the pictures by a splat; below it, its place or scale differs."""
 
 _MISFIT = 0.25
-"""As is one whose depth is off the points by more than this share, in the median."""
+"""Maximum median deviation of a splat's depth from the points, as a share."""
 
 _ALIKE = 0.3
-"""And one whose renderings correlate less with the pictures, in the median."""
+"""Minimum median correlation between a splat's renderings and the pictures."""
 
 _COMPARED = 12
-"""Pictures that a splat is compared with."""
+"""Number of pictures that a splat is compared with."""
 
 
 def modeled(
     source: Source, path: Path, on_progress: Progress = lambda stage, steps: None
 ) -> Source:
-    """Gives a capture depth that is rendered from a trained splat.
+    """Adds depth rendered from a trained splat to a capture.
 
-    Opacity is its confidence; pixels whose depth two other images contradict are holes.
+    Opacity serves as confidence; pixels whose depth two other images contradict become holes.
 
     Args:
         source: the images.
@@ -125,8 +125,8 @@ def modeled(
         on_progress: for a progress bar.
 
     Raises:
-        InputError: the splat is of another place or scale than the cameras; says by how much.
-        SceneFileError: it cannot be read.
+        InputError: place or scale of the splat do not match the cameras; says by how much.
+        SceneFileError: the splat cannot be read.
     """
     scene = read_scene(path)
     side = max(max(lens.width, lens.height) for lens in source.lenses)
@@ -180,8 +180,8 @@ def _some_points(depth: np.ndarray, photo: Photo, step: int = 16) -> np.ndarray:
 def _check_model(
     source: Source, thin: Source, path: Path, depths: list[np.ndarray], alike: list[float]
 ) -> None:
-    """Refuses a splat of another place or scale than the cameras."""
-    what = f"{path}: the splat is of another place or scale than {source.name}: "
+    """Refuses a splat whose place or scale does not match the cameras."""
+    what = f"{path}: the splat does not match the place or scale of {source.name}: "
     todo = "; give the splat that was trained on this capture, in its coordinates"
     covered = float(np.mean([(depth > 0.0).mean() for depth in depths]))
     if covered < _COVERED:
@@ -197,12 +197,12 @@ def _check_model(
             )
     if alike and np.median(alike) < _ALIKE:
         raise InputError(
-            f"{what}its renderings and the pictures correlate by {np.median(alike):.2f} only{todo}"
+            f"{what}its renderings correlate with the pictures by only {np.median(alike):.2f}{todo}"
         )
 
 
 def swept(source: Source, on_progress: Progress = lambda stage, steps: None) -> Source:
-    """Gives a capture depth swept from its photos, at most `_SWEPT_SIDE` pixels wide.
+    """Adds depth swept from its photos to a capture, at most `_SWEPT_SIDE` pixels wide.
 
     Args:
         source: images with points.
@@ -227,7 +227,7 @@ def swept(source: Source, on_progress: Progress = lambda stage, steps: None) -> 
         on_progress("", 1)
     on_progress("sweeping depth from photos", len(source))
     found = sweep(photos, points.__getitem__, lambda: on_progress("", 1))
-    # What a mask hides has no brightness.
+    # Masked pixels have no brightness.
     depths = [depth * (photo.gray > 0.0) for depth, photo in zip(found, photos, strict=True)]
 
     def read(index: int) -> Picture:
@@ -237,7 +237,7 @@ def swept(source: Source, on_progress: Progress = lambda stage, steps: None) -> 
 
 
 def points_shown(source: Source, index: int) -> np.ndarray:
-    """Lists the sparse points that an image shows, [k, 3] in the capture's coordinates."""
+    """Lists the sparse points visible in an image, [k, 3] in the capture's coordinates."""
     _, depth = source.read(index)
     camera, pose = source.camera(index), source.poses[index]
     row, column = np.nonzero((depth > 0.0) & np.isfinite(depth))
@@ -248,7 +248,7 @@ def points_shown(source: Source, index: int) -> np.ndarray:
 
 
 def _failed(source: Source, found: Source) -> str | None:
-    """Says why swept depth is not believed; None: it is."""
+    """Returns the reason why swept depth is not credible, or None if it is."""
     kept: list[float] = []
     off: list[np.ndarray] = []
     for index in range(len(source)):
@@ -257,7 +257,7 @@ def _failed(source: Source, found: Source) -> str | None:
         off.append(_off(depth, found, index, points_shown(source, index)))
     share = np.mean(kept) / _unmasked(found)
     if share < _LEAST_KEPT:
-        return f"the photos agree on {100 * share:.1f} % of their pixels only"
+        return f"the photos agree on only {100 * share:.1f} % of their pixels"
     ratio = np.concatenate(off)
     median = float(np.median(np.abs(ratio))) if len(ratio) else 0.0
     if median > _CONTRADICTED:
@@ -277,7 +277,7 @@ def _unmasked(source: Source) -> float:
 
 
 def _off(depth: np.ndarray, found: Source, index: int, points: np.ndarray) -> np.ndarray:
-    """Computes by which share of their depth an image's depth is off its points, [k]."""
+    """Computes the relative deviation of an image's depth from its points, [k]."""
     place = projected(found.camera(index), found.poses[index], points)
     row, column = place.row[place.is_in].astype(int), place.column[place.is_in].astype(int)
     said, z = depth[row, column], place.z[place.is_in]

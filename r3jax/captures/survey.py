@@ -1,15 +1,15 @@
-"""A first look at some images: do they fit together, how large is the place, how fine to audit?
+"""Surveys some images: checks their consistency, and chooses scale, bounds and voxel size.
 
-Everything downstream counts in rooms: a range of 5, free cells of 0.2, a margin of 0.3. A capture
-in meters with depths of a room's size stays as it is; every other is scaled so that what its
-images show (95 % of the depths) lies within the range. COLMAP's models have no meters at all:
-their units stay their own in all that is written, and only the audit sees them scaled.
+All later stages assume the scale of a room: a range of 5, free cells of 0.2, a margin of 0.3. A
+capture in meters with depths of a room's size is not scaled; every other is scaled so that 95 % of
+its depths lie within the range. COLMAP's models have no metric scale: all output keeps their own
+units, and only the audit scales them.
 
-Poses that have diverged are left out. Tracking that is lost, a glitch of GPS, or a bundle
-adjustment that diverges puts a camera kilometers away, and a map of the whole would be all void.
-Cameras are linked where they stand within a few extents of the capture of each other; the largest
-group is the capture. One or two cameras beside it have diverged, unless what they show is what
-others show: an overview of an object from far away. A second room has more cameras, and stays.
+Diverged poses are left out. Lost tracking, a GPS glitch, or a diverging bundle adjustment can put a
+camera kilometers away, and a map of everything would be almost empty. Cameras are linked if they
+are within a few extents of the capture of each other; the largest group is the capture. One or two
+cameras outside of it have diverged, unless they show the same surfaces as others: an overview of an
+object from far away. A second room has more cameras, and is kept.
 
 Shape symbols: n poses; k depths or points.
 """
@@ -35,19 +35,19 @@ from r3jax.frame import FAR
 from r3jax.geometry.voxels import INDEX_LIMIT
 
 _APART = 5.0
-"""Cameras farther apart than this, in extents of the capture, are not linked."""
+"""Maximum distance between linked cameras, in extents of the capture."""
 
 _GROUP = 2
-"""Larger groups of cameras are a place of their own."""
+"""Maximum size of a diverged group of cameras; larger groups are separate places."""
 
 _COMPARED = 24
-"""Pictures of the others that are read."""
+"""Maximum number of pictures of the other cameras that are read."""
 
 _SAME = 0.1
-"""Surfaces that lie so close are one, as a share of their distance from the camera."""
+"""Surfaces this close count as one, as a share of their distance from the camera."""
 
 _COMMON = 0.3
-"""Share of what a camera shows that others must show."""
+"""Minimum share of a camera's points that other cameras must also show."""
 
 _SMALLEST = 0.02
 """All of it lies within this share of the camera's distance: a dot, in which nothing is seen."""
@@ -59,10 +59,10 @@ def strays(cameras: np.ndarray, depth: float, points_of: Callable[[int], np.ndar
     Args:
         cameras: positions, [n, 3].
         depth: a typical depth, in the same units.
-        points_of: reads what the picture of a camera shows, [k, 3] in the same coordinates.
+        points_of: reads the points in the picture of a camera, [k, 3] in the same coordinates.
 
     Returns:
-        Their numbers, ascending; none if there is no group that most cameras belong to.
+        Indices of these cameras, ascending; empty if no group contains most cameras.
     """
     from_middle = np.linalg.norm(cameras - np.median(cameras, axis=0), axis=1)
     group = _groups(cameras, _APART * (float(np.median(from_middle)) + 2.0 * depth))
@@ -88,7 +88,7 @@ def _groups(cameras: np.ndarray, reach: float) -> np.ndarray:
 
 
 def _shares(camera: np.ndarray, shown: np.ndarray, tree: KDTree) -> bool:
-    """Returns True if a camera shows what others show, and at a sufficient size."""
+    """Returns True if a camera shows the same surfaces as others, at a sufficient size."""
     if not len(shown) or not tree.n:
         return False
     distance = np.linalg.norm(shown - camera, axis=1)
@@ -99,7 +99,7 @@ def _shares(camera: np.ndarray, shown: np.ndarray, tree: KDTree) -> bool:
 
 
 RANGE = 5.0
-"""What is farther from a camera does not count as visible [audit units]."""
+"""Range: surfaces farther from a camera do not count as visible [audit units]."""
 
 MARGIN = 0.3
 """Standpoints keep this far from everything [audit units]."""
@@ -126,13 +126,13 @@ _MOST_ACROSS = INDEX_LIMIT // 2
 """Voxels along an axis: an index has 21 bits."""
 
 _LARGEST_VOXEL = 0.2 * RANGE
-"""Larger ones tell no wall from the next [audit units]."""
+"""Maximum voxel size that separates one wall from the next [audit units]."""
 
 _PIXELS = 3.0
 """A voxel at the median depth is at least this wide [px], or it is seen by chance."""
 
 _SURVEYED = 32
-"""Images that are looked at."""
+"""Maximum number of images examined."""
 
 _VALUES, _FEW_VALUES = 4000, 1000
 """Depths taken of each; and of each where poses may have diverged."""
@@ -146,10 +146,10 @@ _MOST_CELLS = 1_000_000
 
 @dataclass(frozen=True)
 class Survey:
-    """How a capture is audited."""
+    """Coordinates, scale and selected images for an audit."""
 
     alignment: Alignment
-    """From the capture's coordinates to the audit's."""
+    """Transform from the capture's coordinates to the audit's."""
 
     up: Vertical
     """The vertical, in the capture's coordinates."""
@@ -158,10 +158,10 @@ class Survey:
     """Indices of the images that are used, ascending."""
 
     strays: tuple[int, ...]
-    """Images that are left out, as their poses have diverged."""
+    """Indices of images that are left out because their poses have diverged."""
 
     bounds: np.ndarray
-    """Box round what the images show and where they were taken, [2, 3] [audit units]."""
+    """Box around all visible surfaces and cameras, [2, 3] [audit units]."""
 
     voxel_size: float
     """Voxel size [audit units]."""
@@ -170,10 +170,10 @@ class Survey:
     """Edge of a cell of the coarse grid [audit units]."""
 
     median_depth: float
-    """Median of all that was measured [capture units]."""
+    """Median of all depths [capture units]."""
 
     far_depth: float
-    """95th percentile of all that was measured [capture units]."""
+    """95th percentile of all depths [capture units]."""
 
     span: float
     """Twice the distance of the farthest camera from the median of all [capture units]."""
@@ -196,11 +196,11 @@ class Survey:
 
 
 def survey_of(source: Source, settings: SurveySettings) -> Survey:
-    """Looks at some images and decides.
+    """Surveys a capture from some of its images.
 
     Raises:
-        ValueError: a setting that makes no sense; depth images that contradict the poses.
-        FormatError: no image has any depth; or a file is missing or broken.
+        ValueError: a setting is invalid, or depth images contradict the poses.
+        FormatError: no image has any depth, or a file is missing or broken.
     """
     chosen = evenly_spaced(len(source), settings.max_frames)
     images = _depth_images(source, chosen)
@@ -265,7 +265,7 @@ def _measured(source: Source, images: list[DepthImage]) -> tuple[np.ndarray, np.
     local = [look.points(_VALUES, rng) for look in images]
     depths = np.concatenate([points[:, 2] for points in local])
     if len(depths) < 3:
-        raise FormatError(Path(source.name), "no picture shows anything whose depth is known")
+        raise FormatError(Path(source.name), "no picture shows a surface of known depth")
     world = [
         points @ look.pose[:3, :3].T + look.pose[:3, 3]
         for points, look in zip(local, images, strict=True)
@@ -274,11 +274,11 @@ def _measured(source: Source, images: list[DepthImage]) -> tuple[np.ndarray, np.
 
 
 def _check_depth(images: list[DepthImage], median: float) -> None:
-    """Refuses depth that no indoor camera measures, or that the poses contradict."""
+    """Refuses depth that is implausible for an indoor camera, or contradicts the poses."""
     if not _NEAREST < median < FAR:
         factor = 10.0 ** round(np.log10(_TYPICAL / median))
         raise InputError(
-            f"the median depth is {median:.4g} m: is its unit right? --depth-scale {factor:g} "
+            f"the median depth is {median:.4g} m: check its unit; --depth-scale {factor:g} "
             f"multiplies by {factor:g} (in a transforms.json: depth_unit_scale_factor); "
             "--trust-depth audits it as it is"
         )
@@ -290,8 +290,8 @@ def _range(far: float, is_metric: bool, wanted: float | None) -> float:
     if wanted is not None:
         if wanted > _FARTHEST * far:
             raise InputError(
-                f"--max-range {wanted:g} is far beyond what the pictures show (95 % lies within "
-                f"{far:.3g}): everything would lie in a few voxels"
+                f"--max-range {wanted:g} is far beyond the depths in the pictures (95 % within "
+                f"{far:.3g}), so everything would lie in a few voxels: give a smaller --max-range"
             )
         return wanted
     if not is_metric:
@@ -327,7 +327,7 @@ def _up(
 
 
 def _check_voxel(voxel: float, bounds: np.ndarray, scale: float) -> None:
-    """Refuses sizes at which a map means nothing."""
+    """Refuses voxel sizes at which a map is meaningless."""
     across = float(np.abs(bounds).max()) / voxel
     if across > _MOST_ACROSS:
         raise InputError(
