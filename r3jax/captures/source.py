@@ -1,11 +1,11 @@
-"""The capture that is audited: posed images with some depth, from any device or program.
+"""Represents a capture as posed images with depth, from any device or program.
 
-An audit needs no more pixels than fall into a voxel each, and no more exactness than a voxel: so
-images are thinned out, not averaged, and lenses are straightened by taking the nearest pixel. Where
-the ideal image looks past the lens's own, there is no pixel.
+An audit needs about one pixel per voxel, and no more accuracy than a voxel. Images are therefore
+subsampled, not averaged, and lenses are undistorted by taking the nearest pixel. Pixels of the
+undistorted image that lie outside of the original one are missing.
 
-Captures without depth get sparse depth images from points. Where a structure from motion says which
-image sees which point, that is taken; of a mere cloud (nerfstudio's `ply_file_path`) an image sees
+Captures without depth get sparse depth images from points. If structure from motion records which
+image sees which point, this is used; of a plain cloud (nerfstudio's `ply_file_path`) an image sees
 the points that no nearer one hides.
 
 Shape symbols: n images; m points; H, W image size; h, w size of a thinned image.
@@ -257,7 +257,7 @@ MAX_SIDE = 640
 """Images are thinned out until their longer side has no more pixels."""
 
 _FEWEST_POINTS = 50
-"""Fewer points say nothing of a place: reconstructions have thousands."""
+"""Minimum number of points; reconstructions have thousands."""
 
 _MAX_POINTS = 500_000
 """Larger clouds are thinned out: a voxel needs one point."""
@@ -279,7 +279,7 @@ class Source:
     """Posed images, in the capture's own coordinates, read one by one."""
 
     name: str
-    """What the reader calls the capture."""
+    """Name of the capture in reports."""
 
     poses: np.ndarray
     """`T_world_camera`, [n, 4, 4] float64: OpenCV axes."""
@@ -294,29 +294,29 @@ class Source:
     """Where depth comes from."""
 
     is_metric: bool
-    """True if a unit is a meter."""
+    """True if the capture's unit is a meter."""
 
     up: np.ndarray | None
-    """The vertical, [3], where the format says so."""
+    """The vertical, [3]; None if the format does not define it."""
 
     stride: int
     """Stride of the pixels that are read."""
 
     read: Callable[[int], Picture]
-    """The thinned image of an index."""
+    """Reads the thinned image with an index."""
 
     has_images: bool = True
-    """False where no image is there, only depth or points: nothing is said of colors."""
+    """False if the images are missing and there is only depth or points: colors are not known."""
 
     remark: str | None = None
-    """What the capture holds beside its images, a sentence."""
+    """Remark on the capture for reports, in sentences."""
 
     photograph: Callable[[int, int], Photograph] | None = None
     """Reads an image of an index for a comparison with others, thinned by a stride; None: there are
     no images."""
 
     reconstruction: Reconstruction | None = None
-    """How well the structure from motion went; None: the format does not say."""
+    """Quality measures of the structure from motion; None if the format has none."""
 
     def __len__(self) -> int:
         """Returns the number of images."""
@@ -387,11 +387,11 @@ class Source:
 
 
 def source_of(capture: Run | PosedImages, name: str) -> Source:
-    """Makes any capture a source for an audit.
+    """Creates a source for an audit from any capture.
 
     Args:
-        capture: what was opened; a recording with its poses as they are (`up="z"`).
-        name: for the reader.
+        capture: the opened capture; for a recording, with unchanged poses (`up="z"`).
+        name: name of the capture in reports.
 
     Raises:
         FormatError: no images, neither depth nor points, a damaged cloud, or a lens that cannot

@@ -1,4 +1,4 @@
-"""Estimates which way is up, and how far off the estimate may be, from cameras and surfaces.
+"""Estimates the vertical and its uncertainty from cameras and surfaces.
 
 The posterior of the vertical u on the sphere, p(u) ~ exp(C(u) + S(u)):
 
@@ -68,13 +68,13 @@ _AROUND, _STEPS = 5.0, 25
 """Half-width [deg] and steps of the finer grid round the maximum."""
 
 _HELD = 0.95
-"""Share of the posterior that lies within the angle that is told."""
+"""Share of the posterior that lies within the reported angle."""
 
 _TRUST = 0.5
-"""Power of the posterior when it tells the angle: observations are alike in unforeseen ways."""
+"""Power of the posterior for the reported angle, since observations are correlated."""
 
 _LEAST = 3.0
-"""No estimate is better than this [deg]: floors slope, and poses drift."""
+"""Minimum uncertainty [deg]: floors slope, and poses drift."""
 
 _SNAP = 8.0
 """An estimate this near to an axis [deg] is that axis, unless the evidence tells them apart."""
@@ -95,13 +95,13 @@ class Normals(NamedTuple):
 
 @dataclass(frozen=True)
 class Vertical:
-    """Which way is up."""
+    """The vertical of a capture."""
 
     direction: np.ndarray
     """In the capture's coordinates, [3], unit length."""
 
     within: float | None = None
-    """How far off the direction may be [deg]; None: it was given, by the user or the format."""
+    """Uncertainty of the direction [deg]; None if it was given by the user or the format."""
 
 
 def block_normals(depth: np.ndarray, camera: Camera, rotation: np.ndarray) -> Normals:

@@ -1,1 +1,1 @@
-"""What is wrong with single frames: blur, light, depth against poses, repetition."""
+"""Finds faults of single frames: blur, light, poses that contradict the depth, repetition."""

@@ -1,9 +1,9 @@
-"""What is wrong with single frames, as findings: which frames, what it is, what to do next time.
+"""Reports faults of single frames as findings: the frames, the fault, and what to do next time.
 
-Every frame is read once and kept as blocks; it is compared with a few neighbors, so time and memory
-grow with the number of frames (of which an audit uses at most `max_frames`), and not with its
-square. Each threshold says how it was chosen; `tests/captures/faults` holds them to a rendered
-walk, damaged on purpose, and to a real recording.
+Every frame is read once and stored as blocks. It is compared with a few neighbors, so time and
+memory grow linearly with the number of frames (an audit uses at most `max_frames`). Each threshold
+documents how it was chosen; `tests/captures/faults` checks them on a rendered walk, damaged on
+purpose, and on a real recording.
 
 Shape symbols: n frames.
 """
@@ -38,17 +38,17 @@ _SMEARED = 0.6
 0.2 to 0.35 after a motion of 3 to 9 pixels, 0.8 to 1 in sharp frames."""
 
 _FAST = 0.25
-"""An image that moves by so much of its width between two frames moves fast."""
+"""Image motion between two frames that counts as fast, as a share of the width."""
 
 _NEAR = 0.25
-"""Phones do not focus on what is nearer [m]."""
+"""Minimum focus distance of phones [m]."""
 
 LIGHT = 0.05
 """Change of brightness or tint that a splat cannot explain: 5 % of a mid gray alone limits PSNR to
 32 dB. Frames of a rendered walk, with their highlights, differ by up to 1 %."""
 
 _LITTLE = 0.01
-"""Pairs that differ by less have the same exposure."""
+"""Maximum difference between pairs with the same exposure."""
 
 _PAIRS_OF_CHANCE = 2
 """Number of largest differences between two frames that a mirror may cause; ignored."""
@@ -64,7 +64,7 @@ _MISFIT = 0.08
 """Where cameras and depth are off by more, blocks that seem to show one surface do not."""
 
 _NAMED = 5
-"""Pictures that a sentence names."""
+"""Maximum number of pictures named in a sentence."""
 
 Kind = Literal[
     "blur", "focus", "brightness", "tint", "pose", "scale", "ray", "camera", "repeat", "stray"
@@ -73,51 +73,51 @@ Kind = Literal[
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is wrong."""
+    """One fault and the frames that show it."""
 
     kind: Kind
-    """What it is."""
+    """Kind of the fault."""
 
     what: str
-    """The same in a sentence, with numbers."""
+    """Description of the fault in a sentence, with numbers."""
 
     todo: str
     """What to do next time, a sentence."""
 
     frames: tuple[int, ...]
-    """Images of the capture that show it, the worst first; none where it is all of them."""
+    """Indices of images that show it, the worst first; empty if all of them do."""
 
     captions: tuple[str, ...]
-    """What to say of each of these frames."""
+    """Caption of each of these frames."""
 
     value: float
-    """How bad the worst is; see `what` for its meaning."""
+    """Size of the worst fault; see `what` for its meaning."""
 
 
 @dataclass(frozen=True)
 class Faults:
-    """What is wrong with single frames."""
+    """Faults of single frames."""
 
     findings: tuple[Finding, ...]
 
     compared: int
-    """Frames of which at least one other shows the same surface."""
+    """Number of frames whose surfaces at least one other frame shows."""
 
     looked_at: int
-    """Frames that were looked at."""
+    """Number of frames that were checked."""
 
     record: dict[str, Any]
-    """Numbers of every frame, by name; None where nothing can be said."""
+    """Measurements of every frame, by name; None if not known."""
 
     left_out: Mapping[int, str] = field(default_factory=dict[int, str])
-    """Images that cannot be read, by their numbers in the capture, and why not."""
+    """Reasons for unreadable images, by their indices in the capture."""
 
     without_depth: tuple[int, ...] = ()
-    """Images of which no depth is known: what they show cannot be told."""
+    """Indices of images without known depth, whose surfaces are not known."""
 
     fits: bool = True
-    """False where depth and cameras contradict each other: what pictures show of the same surface
-    is not known then, nor are blur, exposure and white balance."""
+    """False if depth and cameras contradict each other: then pictures of the same surface cannot be
+    matched, and blur, exposure and white balance are not known."""
 
 
 def find_faults(
@@ -131,8 +131,8 @@ def find_faults(
 
     Args:
         source: the capture.
-        chosen: images that are looked at.
-        on_frame: called after each of them.
+        chosen: indices of the images to check.
+        on_frame: called after each image.
         fits: False if depth and poses are known to contradict each other.
 
     Raises:
@@ -195,14 +195,14 @@ def faults_of(
     *,
     fits: bool = True,
 ) -> Faults:
-    """As `find_faults`, of images in blocks.
+    """Finds faults as `find_faults` does, from block images.
 
     Args:
-        images: one for each chosen.
-        chosen: their numbers in the capture, [n].
+        images: the block image of each chosen frame.
+        chosen: their indices in the capture, [n].
         labels: names of all images of the capture.
         is_metric: True if a unit is a meter.
-        has_colors: False if the colors are made up.
+        has_colors: False if there are no real colors.
         fits: False if depth and poses are known to contradict each other.
     """
     pairs = overlaps(images)
@@ -231,7 +231,7 @@ def faults_of(
 
 @dataclass(frozen=True)
 class _Names:
-    """How to call frames."""
+    """Names of the checked frames."""
 
     chosen: np.ndarray
     labels: Sequence[str]
@@ -250,7 +250,7 @@ class _Names:
         captions: Sequence[str],
         value: float,
     ) -> Finding:
-        """Makes a finding about some of the checked frames."""
+        """Creates a finding about some of the checked frames."""
         frames = tuple(int(self.chosen[number]) for number in numbers)
         return Finding(kind, what, todo, frames, tuple(captions), value)
 
