@@ -1,1 +1,1 @@
-"""The benchmark: scenes x policies x seeds on equal terms, each cell done once and recorded."""
+"""Runs benchmarks: scenes x policies x seeds on equal terms; each cell is recorded once."""

@@ -1,6 +1,6 @@
-"""The unit of work: scene x policy x seed on conditions that all cells share, and its files.
+"""Defines a cell, the unit of work (scene x policy x seed under shared conditions), and its files.
 
-What all have in common stands in one place, `Conditions`: that makes a benchmark fair.
+All shared settings are in one place, `Conditions`, which makes a benchmark fair.
 """
 
 import dataclasses
@@ -60,14 +60,14 @@ class Conditions(ExplorationTerms, TrainingTerms):
     """Budget, sensor, maps, clock, training and evaluating: the same for every policy.
 
     Raises:
-        ValueError: a setting that cannot work, a snapshot beyond the budget.
+        ValueError: a setting is invalid, or a snapshot is beyond the budget.
     """
 
     budget: str = "views:60"
     """Budget of every exploration: `views:N`, `seconds:S` or `meters:M`."""
 
     snapshots: tuple[str, ...] = ()
-    """Where a model is trained and evaluated, in any of these units; by default at the budget."""
+    """When a model is trained and evaluated, in any of these units; by default at the budget."""
 
     cell_size: float = 0.2
     """Edge of a cell of the coarse grid [m]."""
@@ -82,7 +82,7 @@ class Conditions(ExplorationTerms, TrainingTerms):
     """Further settings of `TrainConfig` by name; those at their defaults are left out."""
 
     def __post_init__(self) -> None:
-        """Refuses what cannot work, before anything is started."""
+        """Refuses invalid settings before the benchmark starts."""
         if not self.snapshots:
             object.__setattr__(self, "snapshots", (self.budget,))
         budget = parse_budget(self.budget)
@@ -133,7 +133,7 @@ class Conditions(ExplorationTerms, TrainingTerms):
         )
 
     def policy(self, name: str, settings: dict[str, Any]) -> Policy:
-        """Makes a policy that scores what this sensor sees.
+        """Creates a policy that scores views of this sensor.
 
         Args:
             name: one of `planning.registry.policy_names()`.
@@ -141,7 +141,7 @@ class Conditions(ExplorationTerms, TrainingTerms):
                 `motion` the name of a motion or its settings.
 
         Raises:
-            ValueError: an unknown name, or a value that is impossible.
+            ValueError: a name is unknown, or a value is invalid.
         """
         planner = {k: v for k, v in settings.items() if not k.startswith(_SCORING)}
         scoring: dict[str, Any] = {
@@ -193,13 +193,13 @@ def snapshot_order(snapshot: str) -> tuple[str, float]:
 
 @dataclass(frozen=True)
 class Cell:
-    """One exploration and what is trained on it. Small: it travels to other processes."""
+    """One exploration and the trainings on it. Small, as it is sent to other processes."""
 
     scene: str
     """Embedded scene by name, or `mesh:<file>`."""
 
     scene_hash: str
-    """SHA-256 of what the scene shows."""
+    """SHA-256 of the scene's content."""
 
     policy: str
     """The policy."""
@@ -208,7 +208,7 @@ class Cell:
     """Seed of exploration, sensor noise and training."""
 
     conditions: Conditions
-    """What all cells have in common."""
+    """Conditions that all cells share."""
 
     test_views_hash: str
     """Hash of the scene's test set."""
@@ -223,32 +223,32 @@ class Cell:
     """Vertical axis of a mesh file; None: as its format has it."""
 
     scale: float = 1.0
-    """Metres in a unit of a mesh file. It and the next count with the scene's hash."""
+    """Meters per unit of a mesh file. This and the next field are covered by the scene's hash."""
 
     cull_backfaces: bool = False
-    """Whether faces seen from behind are not there."""
+    """True to make faces invisible from behind."""
 
     submission: str | None = None
-    """Hash of the submission whose frames are taken again; None: the policy explores."""
+    """Hash of the submission whose frames are rendered again; None if the policy explores."""
 
     sources: dict[str, str] = field(default_factory=dict[str, str])
-    """What `sources_of` the policy was when the cell was planned."""
+    """Result of `sources_of` the policy when the cell was planned."""
 
     @property
     def scene_name(self) -> str:
-        """What tables call the scene: a mesh file without folder and suffix."""
+        """Name of the scene in tables; for a mesh file, without folder and suffix."""
         scene = self.scene.removeprefix("mesh:")
         return Path(scene).stem if scene != self.scene else scene
 
     @property
     def name(self) -> str:
-        """Name of its folder: readable, and another one for everything that differs."""
+        """Name of its folder: readable, and unique for each identity."""
         readable = re.sub(r"[^\w.-]+", "_", f"{self.scene_name}-{self.policy}")[:_LONGEST_NAME]
         return f"{readable}-seed{self.seed}-{self.identity_hash[:12]}"
 
     @functools.cached_property
     def identity_hash(self) -> str:
-        """SHA-256 of everything that the results depend on."""
+        """SHA-256 of all inputs that the results depend on."""
         text = json.dumps(identity(self), sort_keys=True, allow_nan=False)
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -323,12 +323,12 @@ class CellPaths:
 
     @property
     def identity(self) -> Path:
-        """What the cell is, for the reader."""
+        """Description of the cell for people."""
         return self.folder / "cell.json"
 
     @property
     def error(self) -> Path:
-        """Why it failed last time; absent if it did not."""
+        """Reason of the last failure; absent if there was none."""
         return self.folder / "error.txt"
 
     def record(self, snapshot: str) -> Path:

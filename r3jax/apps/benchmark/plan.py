@@ -1,4 +1,4 @@
-"""What a benchmark has to do: scenes x policies x seeds, and which of it is done."""
+"""Plans a benchmark: scenes x policies x seeds, and which cells are finished."""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -25,28 +25,28 @@ from r3jax.splatting.views import load_views
 
 @dataclass(frozen=True)
 class Request:
-    """What the user asks for."""
+    """The benchmark that the user requests."""
 
     scenes: tuple[str, ...]
     """Embedded scenes by name, or `mesh:<file>`."""
 
     policies: tuple[str, ...]
-    """Their names."""
+    """Names of the policies."""
 
     seeds: tuple[int, ...]
-    """One exploration and one training each."""
+    """Seeds, with one exploration and one training each."""
 
     conditions: Conditions
-    """The same for all."""
+    """Conditions of all cells."""
 
     max_test_views: int | None = 120
-    """Test views of a scene at most; None: all of the lattice."""
+    """Maximum number of test views of a scene; None for all of the lattice."""
 
     settings: dict[str, Any] = field(default_factory=dict[str, Any])
     """Settings of all policies that differ from their defaults."""
 
     sweeps: dict[str, list[Any]] = field(default_factory=dict[str, list[Any]])
-    """Values to try of further settings, by name: all combinations make cells."""
+    """Values of further settings to sweep, by name; each combination becomes a cell."""
 
     @property
     def points(self) -> list[dict[str, Any]]:
@@ -58,10 +58,10 @@ class Request:
     """Vertical axis of mesh files; None: as their format has it."""
 
     scale: float = 1.0
-    """Metres in a unit of the mesh files."""
+    """Meters per unit of the mesh files."""
 
     cull_backfaces: bool = False
-    """Whether faces seen from behind are not there."""
+    """True to make faces invisible from behind."""
 
 
 def make_plan(

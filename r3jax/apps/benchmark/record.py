@@ -45,7 +45,7 @@ _PARTS = {
     "test_views": {"hash": str, "resolution": int},
     "views": {"view": list[int]},
 }
-"""What tables and figures take for granted."""
+"""Fields that tables and figures rely on."""
 
 CELLS = "cells.jsonl"
 """All records of a benchmark, one a line."""

@@ -1,6 +1,6 @@
-"""One cell: explore once, then for each snapshot train from scratch, evaluate, and record.
+"""Runs one cell: explores once, then trains from scratch, evaluates and records each snapshot.
 
-Finished stages stay finished: a process that is killed at any moment and started again
+Finished stages are not repeated: a process that is killed at any moment and restarted
 resumes after the last complete stage (a training after its last checkpoint).
 """
 
@@ -66,11 +66,11 @@ _LOCK_PATIENCE = 20.0
 
 
 class CellError(RuntimeError):
-    """A cell that cannot be done, with the reason."""
+    """Raised when a cell cannot be computed, with the reason."""
 
 
 def run_cell(cell: Cell, root: Path, on_stage: OnStage = lambda stage: None) -> None:
-    """Does what is left of a cell.
+    """Computes the unfinished part of a cell.
 
     Args:
         cell: what to do.
@@ -78,8 +78,8 @@ def run_cell(cell: Cell, root: Path, on_stage: OnStage = lambda stage: None) -> 
         on_stage: told what happens now.
 
     Raises:
-        CellError: another process is at it, or some snapshots failed; the others are recorded.
-        KeyboardInterrupt: Ctrl-C; the next call goes on from here.
+        CellError: another process works on it, or some snapshots failed; the others are recorded.
+        KeyboardInterrupt: Ctrl-C; the next call resumes from here.
     """
     paths = paths_of(root, cell)
     own_folder(paths.folder, "cell", "move it away")
@@ -142,7 +142,7 @@ def _finished_run(path: Path) -> Run | None:
 
 
 def _explore(cell: Cell, root: Path, paths: CellPaths, on_stage: OnStage) -> Run:
-    """Explores, or goes on with the exploration that was cut off."""
+    """Explores, or resumes an interrupted exploration."""
     conditions = cell.conditions
     on_stage("opening the scene")
     simulator = _open(cell)

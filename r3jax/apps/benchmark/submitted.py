@@ -92,7 +92,7 @@ class Problem:
 
 
 def problems_of(submission: Submission) -> list[Problem]:
-    """Lists what keeps a submission from being judged: rules of the protocol that it breaks."""
+    """Lists the rules of the protocol that a submission breaks, which prevent its evaluation."""
     try:
         if len(submission.frames) < 2:
             raise InputError("a model is trained on two frames at least, and there is one")
@@ -108,10 +108,10 @@ def problems_of(submission: Submission) -> list[Problem]:
 def check_submission(submission: Submission, simulator: Simulator) -> list[Problem]:
     """Lists the rules that a submission breaks, in the order of its lines.
 
-    They bound what a camera can do: the scene has that hash, the path begins at its start and keeps
-    clear of every surface, the clock leaves time for it, frames captured while moving are no more
-    than the loop takes, and all arrive within the budget. How a policy came to its views is its own
-    affair.
+    The rules bound what a camera can do: the scene has the stated hash, the path begins at its
+    start and keeps clear of every surface, the clock allows enough time, there are no more frames
+    captured while moving than the loop would take, and all arrive within the budget. How a policy
+    chooses its views is not checked.
 
     Args:
         submission: as it was read.

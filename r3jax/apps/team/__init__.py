@@ -1,1 +1,1 @@
-"""Several cameras that explore one place and exchange frames."""
+"""Explores one place with several cameras that exchange frames."""

@@ -1,4 +1,4 @@
-"""Teams on disk: a folder with a run for every camera; begun, gone on with, and concluded."""
+"""Begins, resumes and finishes teams on disk: a folder with a run for every camera."""
 
 import contextlib
 import dataclasses
@@ -38,7 +38,7 @@ from r3jax.simulators.clearance import APART, places_beside
 
 @dataclass(frozen=True)
 class Crew:
-    """Everything that `explore_team` is called with."""
+    """Arguments of `explore_team`."""
 
     settings: RunSettings
     """Settings of the first member: budget and configuration are those of all."""
@@ -48,10 +48,10 @@ class Crew:
     seed: int
 
     meet_every: float
-    """Mission clock between two meetings [s]; 0: always in touch."""
+    """Mission time between two meetings [s]; 0 for permanent contact."""
 
     recorded: list[Run] | None = None
-    """What was recorded before; None for a new team."""
+    """Runs recorded so far; None for a new team."""
 
 
 def begin_team(
@@ -103,7 +103,7 @@ def begin_team(
 
 
 def resume_team(folder: Path, stack: contextlib.ExitStack, budget: str | None = None) -> Crew:
-    """Goes on with a team that was cut off: its members' runs say what it was.
+    """Resumes an interrupted team with the settings recorded in its members' runs.
 
     Args:
         folder: the team's folder.
@@ -184,11 +184,11 @@ def _check_leftovers(folder: Path, cameras: int) -> None:
 def write_team_data(
     folder: Path, result: TeamResult, on_run: Callable[[Run], None] = lambda run: None
 ) -> list[Run]:
-    """Writes the data set that all have in common, and that of every run.
+    """Writes the common data set of the team, and that of every run.
 
     Args:
         folder: the team's folder.
-        result: what the team saw.
+        result: result of the team's exploration.
         on_run: called with every run whose data set is written.
 
     Returns:

@@ -1,18 +1,18 @@
-"""Several cameras in one scene: each flies its own mission, and they share the frames.
+"""Explores a scene with several cameras: each flies its own mission, and they share frames.
 
-They fly at the same time. Every member has its own lens, policy, map and mission clock; the one
-whose clock is behind steps next, so a mission lasts as long as its longest clock. At a meeting
-all learn the frames that were taken until then; in between each has its own frames on top. When
-it decides, it takes the views that the others were heading for at the last meeting as taken,
-and leaves to them what lies nearer to them (`ReservedViews`).
+They fly at the same time. Every member has its own lens, policy, map and mission clock. The member
+whose clock is behind steps next, so a mission lasts as long as its longest clock. At a meeting all
+receive the frames taken until then; between meetings each member adds only its own frames. When a
+member decides, it assumes that the views that the others were heading for at the last meeting have
+been taken, and leaves cells that are nearer to the others to them (`ReservedViews`).
 
-No frame is known before it is taken: it is shared from then on, and a member receives it
-at the first meeting after that. Members that decide at the same time decide in turn.
+A frame is shared once it has been taken, and a member receives it at the next meeting. Members that
+decide at the same time decide in turn.
 
-Members share frames, not maps. Maps of their own would not merge into the map of one camera: a
-frame also marks what it saw of the voxels that others had put there, and the grid clips its
-log-odds. Frames in the order of the clock do: two members that received the same frames have the
-same map, bit for bit.
+Members share frames, not maps. Their own maps would not merge into the map of a single camera: a
+frame also marks voxels that others added as seen, and the grid clips its log-odds. Frames in the
+order of the clock do merge: two members that received the same frames have the same map, bit for
+bit.
 """
 
 import functools
@@ -57,7 +57,7 @@ from r3jax.simulators.base import Simulator
 
 @dataclass(frozen=True)
 class PromisedView:
-    """A view that one robot has decided to take, and that is not taken yet."""
+    """A view that one robot has decided on but not yet taken."""
 
     camera: Camera
 
@@ -67,7 +67,7 @@ class PromisedView:
 
 @dataclass
 class ReservedViews:
-    """Decides as another policy does, on what will be known once the promised views are taken."""
+    """Decides like another policy, on the map expected after the promised views."""
 
     policy: Policy
     """The robot that decides."""
@@ -99,7 +99,7 @@ class ReservedViews:
         *,
         key: Array,
     ) -> tuple[Decision | None, Any, PlanInfo]:
-        """Chooses the view that the policy would take if the promised views had been taken."""
+        """Chooses the view that the policy would choose after the promised views."""
         # One after the other: what the first promises to show, the second cannot promise again.
         for view in self.promised:
             pose = jnp.asarray(view.T_world_camera, dtype=jnp.float32)
@@ -126,15 +126,15 @@ class ReservedViews:
 def without_yielded(
     grid: OccupancyGrid, here: Float[Array, " 3"], others: Float[Array, "K 3"]
 ) -> OccupancyGrid:
-    """Returns the grid for a decision that leaves to others what lies nearer to them.
+    """Returns the grid for a decision that leaves cells nearer to others to them.
 
     Cells that are nearer to one of the others than to here do not count, unless that would leave
     nothing to explore.
 
     Args:
         grid: the coarse grid.
-        here: where the camera is [m].
-        others: where the others go [m].
+        here: position of the camera [m].
+        others: destinations of the others [m].
     """
     # Two arrays at a time, never [K, X, Y, Z]; and squares order as distances do, without roots.
     nearest = functools.reduce(jnp.minimum, [squared_distance(grid, other) for other in others])
@@ -157,7 +157,7 @@ class Member:
 
 @dataclass(frozen=True)
 class TeamView:
-    """What all together knew after a view."""
+    """Progress of the whole team after a view."""
 
     seconds: float
     """Mission clock of the member that took it [s]."""
@@ -176,10 +176,10 @@ class TeamResult:
     """A finished exploration by several cameras."""
 
     members: tuple[Result, ...]
-    """Each one's own rows; the map and the grid of each last state are the common ones."""
+    """Results with each member's own rows; map and grid of each final state are the common ones."""
 
     views: tuple[TeamView, ...]
-    """All views in the order of the clock, and what all knew together after each."""
+    """All views in the order of the clock, with the team's progress after each."""
 
     map_state: MapState
     """Map of all frames, in that order."""
@@ -188,13 +188,13 @@ class TeamResult:
 
     @property
     def seconds(self) -> float:
-        """How long the mission lasted: the longest clock [s]."""
+        """Duration of the mission: the longest clock [s]."""
         return max(result.state.seconds for result in self.members)
 
 
 @dataclass(frozen=True)
 class Observation:
-    """A frame that a member has taken."""
+    """A frame taken by a member."""
 
     seconds: float
     """Its mission clock when the frame was in its own map [s]."""
@@ -211,10 +211,10 @@ class SharedFrame:
     frame: Frame
 
     mapping: float
-    """Seconds that it took to join the common map."""
+    """Time to join the common map [s]."""
 
     view: TeamView
-    """Who took it, and what all know since."""
+    """The member that took it, and the team's progress since then."""
 
 
 @dataclass(frozen=True)
@@ -227,7 +227,7 @@ class Common:
     grid: OccupancyGrid
 
     waiting: tuple[Observation, ...] = ()
-    """Taken and not shared yet."""
+    """Frames taken but not yet shared."""
 
 
 def last_meeting(seconds: float, meet_every: float) -> float:
@@ -307,28 +307,28 @@ def explore_team(
 
     Args:
         members: the cameras; all in the same world. Each one's start is free space for all.
-        budget: of each member: seconds of its mission clock, its meters, its views.
-        seed: all randomness follows from it. The first member's is that of `explore`.
+        budget: budget of each member: seconds of its mission clock, its meters, or its views.
+        seed: random seed. The first member uses the random numbers of `explore`.
         config: settings of every member's loop.
-        meet_every: seconds between two meetings; 0: the radio is always on. Whatever it is,
-            they meet when all are done. The frames between two meetings are kept in memory.
-        recorders: where each member's run is written; None keeps nothing.
-        resume: what was recorded of each member before the team was cut off. All of it is decided
-            and mapped again, only the images are not taken again; under the model clock the
-            result is the one of a team that was never cut off, bit for bit.
+        meet_every: time between two meetings [s]; 0 for permanent contact. In any case all meet
+            at the end. The frames between two meetings are kept in memory.
+        recorders: writers of the members' runs; None to record nothing.
+        resume: the recorded run of each member of an interrupted team. All decisions and maps are
+            computed again, only the images are reused; under the model clock the result is that of
+            an uninterrupted team, bit for bit.
         on_row: called with a member's number and the row of every view.
-        on_stage: called with the name of what happens next.
+        on_stage: called with the name of the next stage.
 
     Returns:
-        Each member's result, and the map of all frames: the one that a single camera would have
-        that had taken them in the order of the clock.
+        Each member's result, and the map of all frames, which equals that of a single camera that
+        took them in the order of the clock.
 
     Raises:
         ValueError: no member, worlds with different boxes, a budget that is not understood, a
             negative interval, a start outside the scene's box.
         RunError: a recorded frame is missing or broken.
-        PolicyError: a program that chooses views has died, hangs, or answers nonsense.
-        OracleReadError: something beside the loop took an image from a simulator.
+        PolicyError: a program that chooses views has died, hangs, or sends invalid answers.
+        OracleReadError: code outside of the loop rendered an image with a simulator.
     """
     config = config or ExplorationConfig()
     budget = parse_budget(budget) if isinstance(budget, str) else budget
@@ -351,7 +351,7 @@ def explore_team(
 
 
 def _check(members: Sequence[Member], meet_every: float) -> None:
-    """Refuses what is no team.
+    """Refuses invalid teams.
 
     Raises:
         ValueError: says what is wrong.
