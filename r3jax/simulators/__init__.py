@@ -1,1 +1,1 @@
-"""Worlds that answer with RGB-D frames. Only here are trimesh, embreex and habitat_sim imported."""
+"""Simulates worlds as RGB-D frames. Only this package imports trimesh, embreex and habitat_sim."""

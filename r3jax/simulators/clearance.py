@@ -1,6 +1,6 @@
-"""Distances from points to a triangle mesh, exact up to rounding; and where a camera may start.
+"""Computes exact distances from points to a triangle mesh, and checks or finds a camera's start.
 
-A given start is checked, a good one is searched for.
+Distances are exact up to rounding. A given start is checked; otherwise a good one is searched for.
 
 Shape symbols: V vertices; F faces; P pieces; n points; D probing directions.
 """
@@ -40,7 +40,7 @@ _FEW = 32
 
 
 class SurfaceDistance:
-    """Answers how far points are from the nearest surface.
+    """Measures the distance from points to the nearest surface.
 
     Large triangles are cut into pieces, so that a search tree over the pieces' centers finds the
     few that can be nearest; the distance to these is exact.

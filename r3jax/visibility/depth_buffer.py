@@ -1,10 +1,10 @@
-"""Which voxels and points a camera can see: depth buffers of voxels, pinhole and panoramic.
+"""Computes which voxels and points a camera sees, by pinhole and panoramic depth buffers of voxels.
 
 Every voxel is splatted once into an image pyramid, on the level on which it covers at most 2x2
-pixels; then the coarse levels are pushed down. A near voxel so covers many pixels and a far one
+pixels; then the coarse levels are pushed down. A near voxel thus covers many pixels and a far one
 less than one, at the same cost. Walls have no gaps: every voxel covers the pixel centers inside its
-own projection, and the projections of neighbors meet. This is the idea of ODGS, omnidirectional
-splatting, on voxels.
+own projection, and the projections of neighbors meet. This applies the idea of ODGS,
+omnidirectional splatting, to voxels.
 
 Shape symbols: n voxels; m points; h w size of the finest level.
 """
@@ -30,20 +30,20 @@ from r3jax.visibility.views import Placement, View, VisibilityConfig, wrap
 
 
 class DepthBuffer(eqx.Module):
-    """The nearest voxel per pixel, of equals the first."""
+    """The nearest voxel per pixel; the first one if several are equally near."""
 
     distance: Float[Array, "h w"]
-    """Distance of its center from the camera [m]; inf where there is none."""
+    """Distance of the nearest voxel's center from the camera [m]; inf where there is none."""
 
     row: Int[Array, "h w"]
-    """Its number; n where there is none."""
+    """Index of the nearest voxel; n where there is none."""
 
     limit: Float[Array, "h w"]
     """Voxels up to this distance are visible in this pixel [m]."""
 
 
 class Voxels(eqx.Module):
-    """Where voxels are."""
+    """Positions of voxels."""
 
     center: Float[Array, "3 n"]
     """[m]."""
@@ -59,7 +59,7 @@ def depth_buffer(voxels: Voxels, view: View, config: VisibilityConfig) -> DepthB
     """Finds the nearest voxel in every pixel of a view; no derivative passes through it."""
     voxels = jax.lax.stop_gradient(voxels)
     distance, row = _nearest(voxels, view)
-    # A slanting wall has voxels behind one another that are one surface.
+    # On a slanted wall, voxels behind one another belong to one surface.
     limit = surface_limit(distance, view.pixel_angle, config.tolerance * voxels.size)
     return DepthBuffer(distance, row, limit)
 
@@ -133,8 +133,8 @@ def corner_margin(
 ) -> Float[Array, " n"]:
     """Computes `depth_margin`, maximized over the corners of each voxel's projected square.
 
-    Half of the voxels that a cluttered room hides in part show something beside the edge that
-    hides their middle.
+    Of the partly hidden voxels in a cluttered room, half are visible beside the edge that hides
+    their center.
     """
     right = CORNER * voxel_size * place.column_scale
     down = CORNER * voxel_size * place.row_scale
@@ -153,7 +153,7 @@ def corner_margin(
 def is_in_image(view: View, place: Placement) -> Bool[Array, " n"]:
     """Checks which points fall into the image, at any distance."""
     height, width = view.shape
-    # Half-open: a point on the far border belongs to a pixel that is not there.
+    # Half-open: a point on the far border belongs to a pixel outside of the image.
     is_in = (place.column >= 0.0) & (place.column < width) & place.ahead
     return is_in & (place.row >= 0.0) & (place.row < height)
 
@@ -273,9 +273,9 @@ def surface_limit(
 ) -> Float[Array, "h w"]:
     """Computes the distance up to which voxels count as the surface in the buffer [m].
 
-    On a surface at angle a to the line of sight, voxels that lie one behind the other across it
-    are 1 / cos(a) as far apart along the line: the allowance is stretched by that. It stays the
-    same measured across the surface, so what stands behind a wall is not let through, however
+    On a surface at angle a to the line of sight, voxels that lie behind one another across it are
+    1 / cos(a) times as far apart along the line, so the allowance is scaled by this factor.
+    Measured across the surface it stays the same, so objects behind a wall remain hidden, however
     obliquely the wall is seen.
 
     Args:

@@ -1,11 +1,11 @@
-"""Where points of the world fall in a view: pinhole, or all directions round a position.
+"""Projects points of the world into a view: pinhole, or all directions around a position.
 
 The panoramic view is an octahedral map of the sphere: no poles, and its borders wrap in closed
 form.
 
-Besides its place every point gets scales: the sum of the absolute derivatives of a pixel coordinate
-along the world's three axes. Half of it times the edge of a voxel is how far the voxel's projection
-reaches, exactly to first order, whichever way the voxel is turned.
+Besides its position every point gets scales: the sum of the absolute derivatives of a pixel
+coordinate along the world's three axes. Half of it times the edge of a voxel is the extent of the
+voxel's projection from its center, exact to first order for any orientation.
 
 Settings are traced, so that a sweep over them compiles once.
 
@@ -32,7 +32,7 @@ def as_float32(value: float | Array) -> Float[Array, ""]:
 
 
 class VisibilityConfig(eqx.Module):
-    """How far a camera sees, and how fine the depth buffers are."""
+    """Range of a camera and resolution of the depth buffers."""
 
     max_range: Float[Array, ""] = eqx.field(default=5.0, converter=as_float32)
     """Range of the sensor: nothing farther away counts as visible [m]."""
@@ -60,7 +60,7 @@ Coordinates = Float[Array, "3 n"] | tuple[Array, Array, Array]
 
 
 class Placement(eqx.Module):
-    """Where points fall in a buffer."""
+    """Projections of points in a buffer."""
 
     column: Float[Array, " n"]
     """Continuous column [px]."""
@@ -72,19 +72,19 @@ class Placement(eqx.Module):
     """Columns per meter [px/m]: the sum over the world's axes of |d column / d axis|."""
 
     row_scale: Float[Array, " n"]
-    """The same of the row."""
+    """The same for the row."""
 
     sum_scale: Float[Array, " n"]
-    """The same of column + row."""
+    """The same for column + row."""
 
     difference_scale: Float[Array, " n"]
-    """The same of column - row."""
+    """The same for column - row."""
 
     distance: Float[Array, " n"]
-    """From the camera [m]."""
+    """Distance from the camera [m]."""
 
     ahead: Bool[Array, " n"]
-    """False behind the camera, where the rest means nothing."""
+    """False behind the camera, where the other fields are meaningless."""
 
 
 class PinholeView(eqx.Module):
@@ -240,12 +240,12 @@ View = PinholeView | PanoramaView
 
 
 def layout_of(view: View) -> calls.Layout:
-    """Finds what kernels need to know of a view while tracing."""
+    """Returns the static properties of a view that kernels need while tracing."""
     return calls.Layout(view.wraps, *view.shape)
 
 
 def for_kernels(view: View, tolerance: Float[Array, ""], focal: Float[Array, ""]) -> calls.Views:
-    """Lays one view out as kernels take it; `jax.vmap` makes `calls.Views` of many."""
+    """Converts one view to the kernels' layout; under `jax.vmap` it gives `calls.Views` of many."""
     angle = jnp.asarray(view.pixel_angle, dtype=jnp.float32)
     rest = (view.max_range, tolerance, angle, focal)
     if isinstance(view, PanoramaView):
