@@ -116,7 +116,7 @@ def without_tiles(side: float, robot: np.ndarray, camera: r3jax.Camera) -> Plann
 
 def by_tiles(side: float, robot: np.ndarray, camera: r3jax.Camera) -> Planner:
     """Makes a planner of tiles: those of one block of rooms, again and again."""
-    bounds = [[-np.inf, -np.inf, 0.0], [np.inf, np.inf, HEIGHT]]
+    bounds = np.array([[-np.inf, -np.inf, 0.0], [np.inf, np.inf, HEIGHT]])
     planner = r3jax.start(camera, bounds)
     far = planner.far
     assert far is not None

@@ -51,7 +51,7 @@ def test_a_check_says_all_that_is_wrong_and_fails(exported, tmp_path, capsys):
     assert main(["benchmark", *words]) == 1
     told = " ".join(capsys.readouterr().err.split())
     assert "damaged.jsonl, line 3, frame 1: `mapping`" in told
-    assert "damaged.jsonl, line 3, frame 1: it arrives" in told
+    assert "damaged.jsonl, line 3, frame 1: `seconds`" in told
     assert "torn.jsonl: line 4" in told
     assert "3 frames" in told
 

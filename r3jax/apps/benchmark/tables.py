@@ -240,7 +240,8 @@ _COSTS = {
     "decision [ms]": ("decision_ms", 1.0, 0),
     "map [MB]": ("map_bytes", 1e-6, 0),
 }
-"""Columns of what the views cost: field of a record's `exploration`, factor, decimals."""
+"""Columns of what the views cost: field of a record's `exploration` or `measured`, factor,
+decimals."""
 
 
 def comparison_table(
@@ -381,7 +382,7 @@ def _cost(cells: Sequence[Cell], method: str, name: str, scenes: Sequence[str]) 
     means: list[float] = []
     for scene in scenes:
         own = [c for c in cells if c["scene"] == scene and method_name(c) == method]
-        values = [cell["exploration"].get(name) for cell in own]
+        values = [(cell["exploration"] | cell.get("measured", {})).get(name) for cell in own]
         if not values or None in values:
             return None
         means.append(float(np.mean(values)))

@@ -170,7 +170,7 @@ def _show_judgment(console: Console, judgment: Judgment, written: dict[str, Path
 
 
 def _metric_table(summaries: tuple[Summary, ...]) -> Table:
-    table = Table("", "mean", "", "median", "5th %", "worst (frame)", "<20 dB", box=None)
+    table = Table("", "mean", "", "median", "5th %", "worst (view)", "<20 dB", box=None)
     for column in table.columns:
         column.no_wrap = True
         column.justify = "left" if column is table.columns[0] else "right"

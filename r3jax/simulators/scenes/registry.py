@@ -49,7 +49,9 @@ def open_world(spec: str, up: str | None = None, scale: float | int = 1.0) -> Wo
         spec: the name of an embedded scene, or one of `outside_scenes`. For a Habitat scene this is
             its mesh.
         up: vertical axis of a mesh file, "y" or "z"; None: y for glTF, z for everything else.
-        scale: unit of a mesh file [m]. Raises:
+        scale: unit of a mesh file [m].
+
+    Raises:
         ValueError: the scene is unknown, `up` or `scale` is given for a scene that is no mesh
             file, or the mesh file is refused (see `load_world`) or missing.
     """

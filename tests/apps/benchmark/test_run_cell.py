@@ -38,7 +38,8 @@ SCHEMA = {
     "exploration": dict.fromkeys(
         ("seconds", "metres", "radians", "known_share", "mean_renderability"), float
     )
-    | {"views": int, "outcome": str},
+    | {"views": int, "map_bytes": int, "outcome": str},
+    "measured": {"decision_ms": float},
     "metrics": dict.fromkeys(("psnr", "psnr_measured", "ssim"), dict) | {"lpips": None},
     "views": dict.fromkeys(
         ("view", "psnr", "psnr_measured", "ssim", "coverage", "measured", "renderability"), list
@@ -151,7 +152,11 @@ def run_until(stage, room, root):
 
 def without_clock(record):
     """What does not depend on when and where it was made."""
-    return {name: value for name, value in record.items() if name not in ("commit", "machine")}
+    return {
+        name: value
+        for name, value in record.items()
+        if name not in ("commit", "machine", "measured")
+    }
 
 
 @pytest.mark.slow

@@ -96,7 +96,8 @@ def test_a_comparison_has_means_differences_and_costs():
     cells = benchmark(("random", "r3", "r3-pano"), views=6)
     for cell in cells:
         if cell["policy"] == "r3":
-            cell["exploration"] |= {"decision_ms": 10.0 + cell["seed"], "map_bytes": 3e6}
+            cell["measured"] = {"decision_ms": 10.0 + cell["seed"]}
+            cell["exploration"] |= {"map_bytes": 3e6}
     found = entries_of(comparison_table(cells, reference="r3"))
     scores = scores_by_method(cells, "psnr")
     mean = mean_over_scenes(scores["random"])
