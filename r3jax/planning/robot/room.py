@@ -382,7 +382,7 @@ class _Known:
             square = None if i % 2 else np.ones((3, 3), bool)
             near = np.asarray(ndimage.binary_dilation(near, square, mask=~hit), bool)
         near = near & np.any(self.free & self.within, axis=2)
-        gap = num * (0.5 * blind / self.size + 1.0)
+        gap = num * (blind / self.size + 1.0)
         found = np.repeat(np.repeat(near, num, axis=0), num, axis=1)
         rows, columns = (np.flatnonzero(near.any(axis=axis)) for axis in (1, 0))
         if not len(rows):
@@ -487,17 +487,13 @@ def _floor_at(
     z = voxels[(gap < _FLOOR_WITHIN) & (voxels[:, 2] < position[2] + voxel_size), 2]
     if len(z) >= 20:
         level = np.rint((z - z.min()) / voxel_size).astype(np.int64)
-        num = int((position[2] - z.min()) / voxel_size) + 2
-        count = np.bincount(level, minlength=num)
-        # A camera that never shows the floor shows walls, in which all levels are alike.
-        is_flat = (count >= _FLOOR_SHARE * count.max()) & (count >= 4.0 * np.median(count))
-        if is_flat.any():
-            lowest = int(np.argmax(is_flat))
-            # A floor on the border of two levels fills both of them.
-            is_floor = (level == lowest) | (
-                (level == lowest + 1) & (count[level] >= 0.5 * count[lowest])
-            )
-            return float(z[is_floor].mean())
+        count = np.bincount(level)
+        lowest = int(np.argmax(count >= _FLOOR_SHARE * count.max()))
+        # A floor on the border of two levels fills both of them.
+        is_floor = (level == lowest) | (
+            (level == lowest + 1) & (count[level] >= 0.5 * count[lowest])
+        )
+        return float(z[is_floor].mean())
     x, y = np.clip(_column(position, origin, size), 0, np.array(occupied.shape[:2]) - 1)
     below = np.flatnonzero(
         occupied[x, y] & (origin[2] + size * (np.arange(occupied.shape[2]) + 1) < position[2])
