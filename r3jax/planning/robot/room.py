@@ -487,13 +487,17 @@ def _floor_at(
     z = voxels[(gap < _FLOOR_WITHIN) & (voxels[:, 2] < position[2] + voxel_size), 2]
     if len(z) >= 20:
         level = np.rint((z - z.min()) / voxel_size).astype(np.int64)
-        count = np.bincount(level)
-        lowest = int(np.argmax(count >= _FLOOR_SHARE * count.max()))
-        # A floor on the border of two levels fills both of them.
-        is_floor = (level == lowest) | (
-            (level == lowest + 1) & (count[level] >= 0.5 * count[lowest])
-        )
-        return float(z[is_floor].mean())
+        num = int((position[2] - z.min()) / voxel_size) + 2
+        count = np.bincount(level, minlength=num)
+        # A camera that never shows the floor shows walls, in which all levels are alike.
+        is_flat = (count >= _FLOOR_SHARE * count.max()) & (count >= 3.0 * np.median(count))
+        if is_flat.any():
+            lowest = int(np.argmax(is_flat))
+            # A floor on the border of two levels fills both of them.
+            is_floor = (level == lowest) | (
+                (level == lowest + 1) & (count[level] >= 0.5 * count[lowest])
+            )
+            return float(z[is_floor].mean())
     x, y = np.clip(_column(position, origin, size), 0, np.array(occupied.shape[:2]) - 1)
     below = np.flatnonzero(
         occupied[x, y] & (origin[2] + size * (np.arange(occupied.shape[2]) + 1) < position[2])
