@@ -318,9 +318,7 @@ def _index(whole: np.ndarray) -> np.ndarray:
 def _exchange(state: MapState, tiles: Tiles, middle: Tile) -> tuple[MapState, Mapping[Tile, Rows]]:
     """Moves rows between the table and the tiles: returns the table, and the other tiles."""
     lattice, size = tiles.lattice, float(state.voxel_size)
-    present = np.flatnonzero(np.asarray(state.present))
-    key = np.asarray(state.key)[:, present].astype(np.uint64)
-    whole = key[0] | (key[1] << np.uint64(32))
+    present, whole = _present_rows(state)
     stays = np.ones(len(whole), bool)
     for axis, (first, last) in enumerate(_indices_of(lattice, middle, size)):
         index = _along(whole, axis)
@@ -361,6 +359,13 @@ def _joined(parts: list[_Arrays], tiles: Iterable[Rows], like: MapState, capacit
     names = parts[0]
     rows = {name: np.concatenate([p[name] for p in [*parts, *more]], axis=-1) for name in names}
     return table_of(rows, like, capacity)
+
+
+def _present_rows(state: MapState) -> tuple[np.ndarray, np.ndarray]:
+    """Finds the rows that describe a voxel, and their keys, both words as one number, [n] each."""
+    present = np.flatnonzero(np.asarray(state.present))
+    key = np.asarray(state.key)[:, present].astype(np.uint64)
+    return present, key[0] | (key[1] << np.uint64(32))
 
 
 def _rows_of(state: MapState, rows: np.ndarray, whole: np.ndarray) -> _Arrays:
@@ -481,9 +486,7 @@ def check_view(tiles: Tiles, camera: Camera, max_range: float, voxel_size: float
 
 def whole_map(state: MapState, tiles: Tiles) -> MapState:
     """Joins the rows at hand and those of all tiles in one table, as large as it must be."""
-    present = np.flatnonzero(np.asarray(state.present))
-    key = np.asarray(state.key)[:, present].astype(np.uint64)
-    kept = _rows_of(state, present, key[0] | (key[1] << np.uint64(32)))
+    kept = _rows_of(state, *_present_rows(state))
     return _joined([kept], tiles.voxels.values(), state, state.capacity)
 
 

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from r3jax.apps.benchmark.policy_style import OKABE_ITO, PolicyStyle, legend_below, styles_of
-from r3jax.apps.benchmark.tables import full_title
+from r3jax.apps.benchmark.tables import full_title, groups_on_equal_terms
 from r3jax.errors import InputError
 from r3jax.evaluation.comparison import (
     Cell,
@@ -39,31 +39,18 @@ def curves_of(records: Sequence[Cell]) -> list[tuple[str, list[Cell]]]:
 
     Groups in which no method has two snapshots have no curve, and are left out.
     """
+    axes = {"views": "views", "seconds": "seconds", "meters": "metres", "metres": "metres"}
     found: list[tuple[str, list[Cell]]] = []
-    for snapshot in snapshots_of(records):
-        for record in (r for r in records if r["snapshot"] == snapshot):
-            kind = snapshot.partition(":")[0]
-            for other, group in found:
-                if other == kind and _may_join(group, record):
-                    group.append(record)
-                    break
-            else:
-                found.append((kind, [record]))
-    axes = {"views": "views", "seconds": "seconds", "meters": "metres"}
-    return [(axes[kind], group) for kind, group in found if _has_curve(group)]
+    for kind, axis in axes.items():
+        chosen = [record for record in records if snapshot_kind([record]) == kind]
+        groups = groups_on_equal_terms(chosen, one_snapshot=False)
+        found += [(axis, group) for group in groups if _has_curve(group)]
+    return found
 
 
 def _has_curve(group: Sequence[Cell]) -> bool:
     points = {(method_name(cell), cell["scene"], cell["snapshot"]) for cell in group}
     return len(points) > len({point[:2] for point in points})
-
-
-def _may_join(group: Sequence[Cell], record: Cell) -> bool:
-    try:
-        check_equal_terms([*group, record], one_snapshot=False)
-    except ValueError:
-        return False
-    return True
 
 
 def response_figures(cells: Sequence[Cell]) -> dict[str, Figure]:

@@ -13,14 +13,7 @@ from r3jax.apps.benchmark.figures import curve_figure, curves_of, response_figur
 from r3jax.apps.benchmark.record import CELLS, read_records, write_records
 from r3jax.apps.benchmark.reference_images import path_of_images, read_reference_images
 from r3jax.apps.benchmark.table_formats import to_csv, to_latex, to_markdown
-from r3jax.apps.benchmark.tables import (
-    by_scene_table,
-    comparison_table,
-    headed_groups,
-    quality_table,
-    reference_in,
-    without_empty_columns,
-)
+from r3jax.apps.benchmark.tables import by_scene_table, headed_groups, tables_of_group
 from r3jax.errors import InputError
 from r3jax.evaluation.comparison import Cell, methods_of, view_values, with_short_names
 from r3jax.files import check_own, make_folder, own_folder, write_atomic
@@ -56,10 +49,7 @@ def write_site(root: Path, folder: Path, reference: str | None = None) -> Path:
     make_folder(path.parent / "pictures")
     groups: list[dict[str, Any]] = []
     for number, (heading, group) in enumerate(headed_groups(records)):
-        quality = quality_table(group, heading, with_intervals=True)
-        costs = without_empty_columns(
-            comparison_table(group, reference=reference_in(group, reference))
-        )
+        quality, costs = tables_of_group(group, heading, reference, with_intervals=True)
         figures = {f"response-{number}-{k}": f for k, f in response_figures(group).items()}
         groups.append(
             {

@@ -273,7 +273,7 @@ def comparison_table(
     chosen = list(scenes or scenes_of(cells))
     cells = [cell for cell in cells if cell["scene"] in chosen]
     methods, seeds = methods_of(cells), seed_texts(cells)
-    reference = methods[-1] if reference is None else reference
+    reference = reference_in(cells, None) if reference is None else reference
     if reference not in methods:
         raise InputError(f"there is no record of {reference!r}; there are {', '.join(methods)}")
     columns: dict[str, list[Entry]] = {}
@@ -309,6 +309,18 @@ def comparison_table(
         rows=tuple(Row((method,), seeds[method], entries) for method, entries in lines),
         notes=told,
     )
+
+
+def tables_of_group(
+    group: Sequence[Cell], heading: str, reference: str | None, *, with_intervals: bool = False
+) -> tuple[Table, Table]:
+    """Makes the tables of a group of `headed_groups`: `quality_table`, and `comparison_table`.
+
+    The second one has no columns without a value; `reference` is as in `reference_in`.
+    """
+    costs = comparison_table(group, heading, reference=reference_in(group, reference))
+    quality = quality_table(group, heading, with_intervals=with_intervals)
+    return quality, without_empty_columns(costs)
 
 
 def without_empty_columns(table: Table) -> Table:
@@ -417,16 +429,22 @@ def headed_groups(records: Sequence[Cell]) -> list[tuple[str, list[Cell]]]:
     return found
 
 
-def groups_on_equal_terms(records: Sequence[Cell]) -> list[list[Cell]]:
-    """Groups records of one snapshot that may share a table, each group as large as possible.
+def groups_on_equal_terms(
+    records: Sequence[Cell], *, one_snapshot: bool = True
+) -> list[list[Cell]]:
+    """Groups records that may share a table, each group as large as possible.
 
-    A second record of the same method, scene and seed begins a group of its own.
+    A second record of the same method, scene, seed and snapshot begins a group of its own.
+
+    Args:
+        records: to be grouped.
+        one_snapshot: whether those of a group must be of the same snapshot.
     """
     groups: list[list[Cell]] = []
     for record in records:
         for group in groups:
             try:
-                check_equal_terms([*group, record])
+                check_equal_terms([*group, record], one_snapshot=one_snapshot)
             except ValueError:
                 continue
             group.append(record)

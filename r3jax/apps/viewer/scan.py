@@ -354,6 +354,11 @@ def marked(scan: Scan, picture: int, point: np.ndarray) -> bytes | None:
     ImageDraw.Draw(image).ellipse(
         (x - size, y - size, x + size, y + size), outline=(255, 40, 40), width=max(2, int(size / 5))
     )
+    return _small(image)
+
+
+def _small(image: Image.Image) -> bytes:
+    """Encodes a picture at the size in which the panel shows it."""
     image.thumbnail((_SIDE, _SIDE))
     return png(np.asarray(image))
 
@@ -497,8 +502,7 @@ class ScanPage:
             self.said.content = self._html("place", texts=[str(error)], pictures=[], more=[])
             return
         image = Image.fromarray(np.ascontiguousarray(rgb))
-        image.thumbnail((_SIDE, _SIDE))
-        shown = [{"label": label, "url": data_url(png(np.asarray(image)))}]
+        shown = [{"label": label, "url": data_url(_small(image))}]
         self.said.content = self._html("place", texts=[], pictures=shown, more=[])
 
     def _add_suggested(self) -> None:

@@ -27,12 +27,9 @@ from r3jax.apps.benchmark.tables import (
     Entry,
     Table,
     by_scene_table,
-    comparison_table,
     headed_groups,
     on_equal_terms,
-    quality_table,
-    reference_in,
-    without_empty_columns,
+    tables_of_group,
 )
 from r3jax.cli.console import (
     Bar,
@@ -413,10 +410,7 @@ def print_results(
         return
     notes: dict[str, None] = {}
     for heading, group in headed_groups(records):
-        quality = quality_table(group, heading)
-        costs = without_empty_columns(
-            comparison_table(group, heading, reference=reference_in(group, reference))
-        )
+        quality, costs = tables_of_group(group, heading, reference)
         if form != "terminal":
             write = to_latex if form == "latex" else to_markdown
             _print_text(console, write(replace(quality, notes=())))
