@@ -187,10 +187,6 @@ def submission_of_run(run: Run) -> Submission:
             run.path,
             f"it is incomplete ({run.outcome}): continue by `r3jax explore --resume {run.path}`",
         )
-    if header.scene.get("start") is not None:
-        raise RunError(
-            run.path, "it began at its own --start; the protocol begins at the scene's start"
-        )
     given = dataclasses.asdict(config_of(run))
     default = dataclasses.asdict(ExplorationConfig())
     own = current_name(header.policy["name"]) in HOMES

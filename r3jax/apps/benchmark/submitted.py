@@ -1,7 +1,6 @@
 """Submissions as cells of a benchmark: checked, rendered again, then trained like all others."""
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -109,9 +108,8 @@ def check_submission(submission: Submission, simulator: Simulator) -> list[Probl
     """Lists the rules that a submission breaks, in the order of its lines.
 
     The rules bound what a camera can do: the scene has the stated hash, the path begins at its
-    start and keeps clear of every surface, the clock allows enough time, there are no more frames
-    captured while moving than the loop would take, and all arrive within the budget. How a policy
-    chooses its views is not checked.
+    start and keeps clear of every surface, the clock allows enough time, and all frames arrive
+    within the budget. How a policy chooses its views is not checked.
 
     Args:
         submission: as it was read.
@@ -129,78 +127,71 @@ def check_submission(submission: Submission, simulator: Simulator) -> list[Probl
             "the r3jax, that the views were chosen with"
         )
         return [Problem(None, told)]
-    paths, budget = submission.paths(), parse_budget(submission.budget)
-    lengths = [float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()) for path in paths]
-    if not sum(lengths) <= _MAX_LENGTH:
-        told = f"its paths are {sum(lengths):.3g} m long, more than {_MAX_LENGTH:g} m"
+    paths = submission.paths()
+    if not (metres := sum(map(_length, paths))) <= _MAX_LENGTH:
+        told = f"its paths are {metres:.3g} m long, more than {_MAX_LENGTH:g} m"
         return [Problem(None, f"{told}: are the positions in meters? Submit a shorter run")]
-    told = [(0, text) for text in _check_start(submission, simulator)]
-    told += check_captures(submission, lengths)
     # All paths at once: one by one, ten thousand frames would take a minute.
-    rooms = GroundTruth(simulator).room_along(paths, CLEARANCE)
-    before, metres, views = submission.frames[0], 0.0, 0
-    for frame, path, length, room, place in zip(
-        submission.frames, paths, lengths, *rooms, strict=True
-    ):
+    rooms, places = GroundTruth(simulator).room_along(paths, CLEARANCE)
+    problems = list(_check_frames(submission, begin_at(submission.robot, simulator.start_pose)))
+    for number in np.flatnonzero(rooms < CLEARANCE):
+        at = places[number].round(3).tolist()
+        told = f"its path is {rooms[number]:.3f} m from a surface at {at}: keep {CLEARANCE} m"
+        problems.append(Problem(int(number), told))
+    return sorted(problems, key=lambda problem: problem.frame or 0)
+
+
+def _check_frames(submission: Submission, start: np.ndarray) -> Iterator[Problem]:
+    """Yields the rules that frames break, apart from the distance to surfaces.
+
+    Args:
+        submission: as it was read.
+        start: where its scene is to be begun, [4, 4].
+    """
+    config, budget = submission.config, parse_budget(submission.budget)
+    # A little less, for rounding.
+    longest = config.piece_at(submission.robot.speed or config.speed) * (1.0 - 1e-4)
+    before, pose, metres, views = None, start, 0.0, 0
+    captured, way = 0, 0.0
+    for frame, path in zip(submission.frames, submission.paths(), strict=True):
+        length = _length(path)
         flown = metres + length if frame.metres is None else frame.metres
         texts = [*check_times(submission, before, frame, flown - metres, length)]
-        if room < CLEARANCE:
-            at = place.round(3).tolist()
-            texts.append(f"its path is {room:.3f} m from a surface at {at}: keep {CLEARANCE} m")
-        ends = np.stack([before.position, frame.position])
-        apart = float(np.linalg.norm(path[[0, -1]] - ends, axis=1).max())
-        if apart > _SAME_PLACE:
-            texts.append(f"its path ends {apart:.3f} m from a view: lead from view to view")
+        gap = np.linalg.norm(path[[0, -1]] - np.stack([pose[:3, 3], frame.position]), axis=1).max()
+        turned = math.degrees(angle_between(frame.pose.astype(np.float64), pose))
+        if gap > _SAME_PLACE or (before is None and turned > _SAME_ANGLE):
+            texts.append(
+                f"its path ends {gap:.3f} m from a view, turned by {turned:.2f} degrees: begin at "
+                "the scene's start, and lead from view to view"
+            )
         # A frame captured while moving belongs to the view that it was captured before.
         arrival = frame.seconds - frame.mapping
         spent = {"views": views + 1, "frames": frame.frame + 1, "seconds": arrival, "metres": flown}
         if not budget.allows(**spent):  # pyright: ignore[reportArgumentType]
             over = f"it takes {spent[budget.unit]:g} {budget.unit}, beyond the budget {budget}"
             texts.append(format_budget(f"{over}: end before it"))
-        told += [(frame.frame, text) for text in texts]
-        before, metres, views = frame, flown, views + (not frame.captured)
-    return [Problem(number, text) for number, text in sorted(told, key=lambda each: each[0])]
+        # The loop cuts a path into the fewest equal pieces that are not too long, and captures a
+        # frame between two of them. A budget of views does not count these.
+        captured, way = captured + frame.captured, way + length
+        if captured and captured >= way / longest + frame.captured:
+            texts.append(
+                f"{captured} frames are captured on {way:.3f} m: at the most one on {longest:.3g} m"
+                ", by `capture_every` or `capture_rate` in line 1"
+            )
+        yield from (Problem(frame.frame, text) for text in texts)
+        before, pose, metres = frame, frame.pose.astype(np.float64), flown
+        if not frame.captured:
+            captured, way, views = 0, 0.0, views + 1
 
 
-def _check_start(submission: Submission, simulator: Simulator) -> Iterator[str]:
-    """Yields a problem if the first frame is not taken at the scene's start, at no cost."""
-    first, start = submission.frames[0], begin_at(submission.robot, simulator.start_pose)
-    apart = float(np.linalg.norm(first.position - start[:3, 3]))
-    turned = math.degrees(angle_between(first.pose.astype(np.float64), start))
-    if apart > _SAME_PLACE or turned > _SAME_ANGLE:
-        where = start[:3, 3].round(4).tolist()
-        yield f"it lies {apart:.3f} m and {turned:.2f} degrees from the start {where}: begin there"
-    if first.captured or first.metres:
-        yield "the path begins here: leave out `captured`, and `metres`"
-
-
-def check_captures(submission: Submission, lengths: Sequence[float]) -> Iterator[tuple[int, str]]:
-    """Yields problems of paths with more frames captured while moving than the loop would take.
-
-    The loop cuts a path into the fewest equal pieces that are not too long, and captures a frame
-    between two of them: for n frames the whole path is longer than n of the longest pieces, and
-    the part up to the last of them longer than n / (n + 1) of that.
-    """
-    config, frames = submission.config, submission.frames
-    longest = config.piece_at(submission.robot.speed or config.speed)
-    for is_captured, group in itertools.groupby(frames, key=lambda frame: frame.captured):
-        captured = [frame.frame for frame in group]
-        num, after = len(captured), captured[-1] + 1
-        if not is_captured:
-            continue
-        if not config.captures:
-            yield captured[0], "is captured without `capture_every` or `capture_rate` in line 1"
-            return
-        is_whole = after < len(frames)
-        length = sum(lengths[captured[0] : after + is_whole])
-        least = num * longest * (1.0 if is_whole else num / (num + 1))
-        if length < _less(least):
-            yield captured[0], f"{num} frames are captured on {length:.3f} m, of {least:.3f} m"
+def _length(path: np.ndarray) -> float:
+    """Computes the length of a path [m]."""
+    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
 
 
 def check_times(
     submission: Submission,
-    before: SubmittedFrame,
+    before: SubmittedFrame | None,
     frame: SubmittedFrame,
     flown: float,
     length: float,
@@ -208,21 +199,21 @@ def check_times(
     """Yields a problem where the clock leaves too little time to decide, to fly and to map."""
     config, motion = submission.config, submission.robot
     costs = model_clock(config).costs if config.clock == "model" else {}
-    is_first = frame.frame == 0
-    taken = frame.seconds - frame.mapping - (0.0 if is_first else before.seconds)
-    angle = angle_between(before.pose.astype(np.float64), frame.pose.astype(np.float64))
-    turning = 0.0 if motion.turn_rate is None else math.degrees(angle) / motion.turn_rate
-    flight = max(flown, length) / (motion.speed or config.speed)
-    # Between captured frames the camera turns while it flies; to a view it flies first.
-    is_whole = not (frame.captured or before.captured)
-    needed = flight + turning if is_whole else max(flight, turning)
-    if not (is_first or before.captured):  # what follows a captured frame was decided before it
-        needed += costs.get("reconsidering" if config.plan_while_moving else "planning", 0.0)
+    taken = frame.seconds - frame.mapping - (0.0 if before is None else before.seconds)
+    needed = max(flown, length) / (motion.speed or config.speed)
+    if before is not None:
+        turn = math.degrees(angle_between(before.pose.astype(float), frame.pose.astype(float)))
+        turning = 0.0 if motion.turn_rate is None else turn / motion.turn_rate
+        # Between captured frames the camera turns while it flies; to a view it flies first.
+        is_whole = not (frame.captured or before.captured)
+        needed = needed + turning if is_whole else max(needed, turning)
+        if not before.captured:  # what follows a captured frame was decided before it
+            needed += costs.get("reconsidering" if config.plan_while_moving else "planning", 0.0)
     if frame.mapping < _less(costs.get("mapping", 0.0)):
         yield f"`mapping` is {frame.mapping:g} s, it takes {costs.get('mapping', 0.0):g} s or more"
     if flown < _less(length):
         yield f"`metres` grows by {flown:.4f}, the path has {length:.4f} m: count all of it"
-    if taken < _less(0.0 if is_first else needed):
+    if taken < _less(needed):
         speed = motion.speed or config.speed
         yield (
             f"`seconds` leaves {taken:.4f} s for deciding, {length:.3f} m at {speed:g} m/s and the "
@@ -398,8 +389,7 @@ def retake(
             map_state, grid = add_frame(map_state, grid, taken, config)
             radians += angle_between(pose, frame.pose.astype(np.float64))
             pose = frame.pose.astype(np.float64)
-            length = float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())
-            metres = metres + length if frame.metres is None else frame.metres
+            metres = metres + _length(way) if frame.metres is None else frame.metres
             row = StepRow(
                 step=frame.frame,
                 pose=frame.pose,
@@ -442,10 +432,9 @@ def _choices(frames: Sequence[SubmittedFrame], paths: Sequence[np.ndarray]) -> l
             continue  # captured while moving to a view
         pieces = [path[1:] for path in paths[first : last + 1]]
         whole = np.concatenate([paths[first][:1], *pieces])
-        length = float(np.linalg.norm(np.diff(whole, axis=0), axis=1).sum())
         waypoints = whole.astype(np.float32)
         choices[first] = Choice(
-            frames[last].pose, 0.0, waypoints, length, num_candidates=0, num_reachable=0
+            frames[last].pose, 0.0, waypoints, _length(whole), num_candidates=0, num_reachable=0
         )
         first = last + 1
     return choices
