@@ -60,10 +60,3 @@ def test_a_program_that_fails_gets_one_line_and_the_run_stays(room, tmp_path, ca
     rows = (out / "box" / "trace.jsonl").read_text().splitlines()
     assert [json.loads(row)["kind"] for row in rows] == ["step", "end"]
     assert json.loads(rows[-1])["outcome"] == "failed"
-
-
-@pytest.mark.parametrize("command", ["", "no-such-program", "python 'x"])
-def test_a_program_that_is_not_there_is_told_at_once(room, tmp_path, capsys, command):
-    assert explore(room, tmp_path, "--policy", f"exec:{command}") == 2
-    assert "exec:" in capsys.readouterr().err
-    assert not (tmp_path / "box").exists()

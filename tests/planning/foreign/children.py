@@ -1,9 +1,11 @@
 """Programs that choose views, for the tests: one of them in the standard library alone."""
 
-import os
 import shlex
 import sys
+import time
 from pathlib import Path
+
+import psutil
 
 BEGIN = """
 import json, random, struct, sys
@@ -62,10 +64,13 @@ def command_of(folder: Path, code: str, python: str = sys.executable) -> str:
 
 
 def is_running(pid: int) -> bool:
-    """Whether a process is there and has not ended."""
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    # One that has ended may wait to be reaped.
-    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    """Whether a process is there and has not ended; one that has may wait to be reaped."""
+    return psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+
+
+def wait_for_end(pid: int) -> None:
+    """Waits until a process that was killed has ended."""
+    end = time.monotonic() + 60.0
+    while is_running(pid):
+        assert time.monotonic() < end
+        time.sleep(0.01)

@@ -1,11 +1,9 @@
 """Programs as policies: they decide what the same rule decides here, and break nothing."""
 
 import dataclasses
-import os
 import shlex
 import subprocess
 import sys
-import time
 import venv
 from dataclasses import dataclass
 from pathlib import Path
@@ -217,7 +215,7 @@ while True:
         ),
         (
             "receive(); [send(kind='candidate', index=0) for _ in range(2)]; receive()",
-            "for view 1: |before the request|more than one message",
+            "view 2.*view 1",
         ),
         ("receive(); send(kind='done', view=True)", "view True"),
         ("receive(); asked.clear(); send(kind='done')", "`view`"),
@@ -262,8 +260,7 @@ def test_a_question_that_is_timed_again_is_asked_once_and_takes_as_long(tmp_path
     (session,) = policy._sessions.values()
     pid = session.program._process.pid
     policy.close()
-    with pytest.raises(ProcessLookupError):
-        os.kill(pid, 0)
+    assert not is_running(pid)
     with pytest.raises(PolicyError, match="has ended"):
         decide(later, first[0].T_world_camera, key)
 
@@ -289,29 +286,6 @@ def test_a_state_that_was_stored_is_not_believed(tmp_path):
         decide(dataclasses.replace(seen, policy=other), room.start_pose, jax.random.key(0))
     policy.close()
     other.close()
-
-
-def test_a_loop_that_is_killed_takes_its_program_along():
-    """Also one that hangs, and does not notice that nobody speaks to it any more."""
-    code = """
-import sys, time
-from r3jax.planning.policies.foreign.program import Program
-program = Program(sys.argv[1], 0.0)
-# Until it is the program, and not what sets its limits.
-while b"600" not in open(f"/proc/{program._process.pid}/cmdline", "rb").read().split(b"setpriv")[0]:
-    time.sleep(0.01)
-print(program._process.pid, flush=True)
-time.sleep(600)
-"""
-    hangs = shlex.join([sys.executable, "-I", "-S", "-c", "import time; time.sleep(600)"])
-    words = [sys.executable, "-c", code, hangs]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as loop:
-        pid = int(loop.stdout.readline())
-        loop.kill()
-    end = time.monotonic() + 5.0
-    while is_running(pid) and time.monotonic() < end:
-        time.sleep(0.01)
-    assert not is_running(pid)
 
 
 @pytest.mark.parametrize(("name", "value"), [("answer_seconds", -1.0), ("memory", float("nan"))])

@@ -2,15 +2,14 @@
 
 import shlex
 import sys
-import time
 
 import pytest
 
 from r3jax.planning.policies.foreign.commands import short_name, words_of
 from r3jax.planning.policies.foreign.messages import Message
-from r3jax.planning.policies.foreign.program import IS_LINUX, Program
+from r3jax.planning.policies.foreign.program import Program
 from r3jax.planning.policy import PolicyError
-from tests.planning.foreign.children import is_running
+from tests.planning.foreign.children import is_running, wait_for_end
 
 BEGIN = """
 import json, os, socket, struct, subprocess, sys, time
@@ -60,15 +59,12 @@ def test_a_program_answers_and_ends_with_its_input():
         ("raise ValueError('no weights')", "code 1.*no weights"),
         ("receive(); os.kill(os.getpid(), 9)", "SIGKILL"),
         ("receive(); os.close(1); time.sleep(60)", "output"),
-        ("os.close(0); time.sleep(60)", "input"),
-        ("receive(); os.close(0); time.sleep(60)", "input"),
-        ("receive(); os.close(0); sys.exit(4)", "code 4"),
+        ("receive(); os.close(1); time.sleep(0.1); sys.exit(4)", "code 4"),
         ("print('Loading ...', flush=True); time.sleep(60)", "standard error"),
         (
             "receive(); send(b'\\x02\\0\\0\\0\\0\\0\\0\\0[]'); time.sleep(60)",
             "`header`",
         ),
-        ("receive(); send(2 * TEXT); time.sleep(60)", "20 bytes"),
         ("receive(); send(struct.pack('<II', 1 << 31, 0))", "2147483648"),
         ("receive(); send(b'\\1\\0'); sys.exit()", "code 0"),
     ],
@@ -81,19 +77,6 @@ def test_what_goes_wrong_is_told_and_the_program_ended(code, says):
     assert not is_running(pid)
 
 
-def eventually(holds):
-    end = time.monotonic() + 5.0
-    while not holds() and time.monotonic() < end:
-        time.sleep(0.01)
-    return holds()
-
-
-def test_an_answer_to_half_a_question_is_refused():
-    """The other half would be the beginning of the next question."""
-    with pytest.raises(PolicyError, match="20 bytes"):
-        asked("sys.stdin.buffer.read(8); send(TEXT); time.sleep(60)", x="y" * 1_000_000)
-
-
 def test_a_program_that_hangs_is_given_up_with_what_it_started():
     code = "import signal; signal.signal(15, signal.SIG_IGN)\n"
     code += "child = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(600)'])\n"
@@ -103,7 +86,7 @@ def test_a_program_that_hangs_is_given_up_with_what_it_started():
     with pytest.raises(PolicyError, match=r"`decide`.* 1 s.*child \d+") as told:
         program.ask(Message("decide"), 1.0)
     child = int(str(told.value).rpartition("child ")[2])
-    assert eventually(lambda: not is_running(child))
+    wait_for_end(child)
     assert not is_running(pid)
 
 
@@ -126,44 +109,26 @@ def test_a_program_may_say_much_on_its_standard_error():
     assert asked(code).kind == "fine"
 
 
-def test_memory_has_a_limit():
-    code = "receive(); x = bytearray(600 << 20); send(kind='fine')"
-    if IS_LINUX:
-        with pytest.raises(PolicyError, match="MemoryError"):
-            asked(code, memory=0.25)
-    assert (
-        asked("receive(); x = bytearray(60 << 20); send(kind='fine')", memory=0.25).kind == "fine"
-    )
+def test_memory_below_its_limit_is_free():
+    code = "receive(); x = b'x' * (60 << 20); send(kind='fine')"
+    assert asked(code, memory=0.25).kind == "fine"
 
 
 @pytest.mark.parametrize(
     "code",
     [
-        "import mmap; m = mmap.mmap(-1, 400 << 20)\nfor i in range(0, len(m), 4096): m[i] = 1\n"
-        "time.sleep(1)",
+        "x = b'x' * (400 << 20)",
+        "import mmap; m = mmap.mmap(-1, 400 << 20)\nfor i in range(0, len(m), 4096): m[i] = 1",
         "for _ in range(4):\n    if os.fork() == 0: x = b'x' * (100 << 20); time.sleep(60)\n"
-        "time.sleep(1)",
+        "time.sleep(60)",
     ],
 )
-def test_memory_is_that_of_all_processes_and_what_they_share(code):
-    if not IS_LINUX:
-        pytest.skip("elsewhere nothing tells what processes share")
+def test_memory_is_that_of_all_processes_and_has_a_limit(code):
     with pytest.raises(PolicyError, match=r"0\.25 GiB"):
-        asked(f"receive()\n{code}\nsend(kind='fine')", memory=0.25)
+        asked(f"receive()\n{code}\nsend(kind='fine')\ntime.sleep(60)", memory=0.25)
 
 
-@pytest.mark.parametrize(
-    "file", ["open('/dev/shm/r3jax_test', 'wb')", "os.fdopen(os.memfd_create('x'), 'wb')"]
-)
-def test_a_file_in_memory_is_no_larger_than_the_limit(file):
-    if not IS_LINUX:
-        pytest.skip("elsewhere there are no files in memory")
-    code = f"f = {file}\nif isinstance(f.name, str): os.unlink(f.name)\n"
-    code += "for _ in range(400): f.write(b'x' * (1 << 20))\nf.flush(); send(kind='fine')"
-    with pytest.raises(PolicyError, match="File too large"):
-        asked(f"receive()\n{code}", memory=0.25)
-
-
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere shared pages count for each")
 def test_what_processes_share_counts_once():
     code = (
         "x = b'x' * (120 << 20)\nfor _ in range(4):\n    if os.fork() == 0: time.sleep(60)\n"

@@ -42,7 +42,7 @@ from r3jax.planning.decide import (
 )
 from r3jax.planning.policies.foreign.commands import COMMAND
 from r3jax.planning.policies.foreign.messages import Message
-from r3jax.planning.policies.foreign.program import IS_LINUX, Program
+from r3jax.planning.policies.foreign.program import Program
 from r3jax.planning.policy import Decision, PlanInfo, PolicyError, Situation
 from r3jax.validation.errors import ForeignFileError
 from r3jax.validation.json_text import check_type
@@ -113,8 +113,8 @@ class Foreign:
 
     @property
     def isolation(self) -> dict[str, Any]:
-        """The limits that this system can enforce; None for others."""
-        return {"memory_gib": self.config.memory if IS_LINUX and self.config.memory else None}
+        """The limits that hold; None: no limit."""
+        return {"memory_gib": self.config.memory or None}
 
     def init(self, camera: Camera, grid: OccupancyGrid, *, key: Array) -> PlannerState:
         """Starts the program and sends `hello`.

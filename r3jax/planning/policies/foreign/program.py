@@ -1,18 +1,18 @@
-"""Runs a program that exchanges messages, with limits of time and memory, and always stops it.
+"""Runs a program that exchanges messages, with limits of time and memory, and stops it at the end.
 
 This is not a sandbox: the program has the rights of the user who starts it
 (`docs/howto/policy.md`).
 """
 
 import contextlib
-import os
-import selectors
-import shutil
+import queue
 import signal
 import subprocess
-import sys
+import tempfile
+import threading
 import time
 import weakref
+from typing import IO
 
 import psutil
 
@@ -27,12 +27,8 @@ from r3jax.planning.policies.foreign.messages import (
 )
 from r3jax.planning.policy import PolicyError
 
-IS_LINUX = sys.platform == "linux"
-"""Memory limits are only supported on Linux."""
-
-_CHUNK = 1 << 16
-_TAIL = 2000
-"""Number of bytes kept of its standard error."""
+_TAIL = 600
+"""Bytes at the end of its standard error that a message quotes."""
 
 _GRACE = 1.0
 """Grace period for a program to exit after its input has ended [s]."""
@@ -49,32 +45,26 @@ class Program:
 
         Args:
             command: program and arguments, as for a shell.
-            memory: limit for it and its child processes [GiB]; 0: none.
+            memory: limit for it and its child processes together [GiB]; 0: none.
 
         Raises:
             ValueError: there is no such program.
             PolicyError: it cannot be started.
         """
-        self.command = command
-        self._memory = int(memory * (1 << 30))
-        # On Linux the program ends with its parent, even if the parent is killed.
-        setpriv = shutil.which("setpriv") if IS_LINUX else None
-        first = [setpriv, "--pdeathsig", "KILL"] if setpriv else []
-        pipe = subprocess.PIPE
+        self.command, self._memory = command, memory
+        # A file, which nothing has to read in time.
+        words, pipe = words_of(command), subprocess.PIPE
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115
         try:
-            # A separate session: it is stopped as a group, and Ctrl-C is handled by the loop.
+            # A separate session: Ctrl-C is handled by the loop.
             self._process = subprocess.Popen(
-                [*first, *words_of(command)],
-                stdin=pipe, stdout=pipe, stderr=pipe, bufsize=0, start_new_session=True,
+                words,
+                stdin=pipe, stdout=pipe, stderr=self._errors, bufsize=0, start_new_session=True,
             )  # fmt: skip
         except OSError as error:
+            self._errors.close()
             raise PolicyError(f"{command!r} cannot be started ({error})") from error
-        _limit_memory(self._process.pid, self._memory)
-        for stream in (self._process.stdin, self._process.stdout, self._process.stderr):
-            assert stream is not None
-            os.set_blocking(stream.fileno(), False)
-        self._said = b""
-        self.close = weakref.finalize(self, _end, self._process)
+        self.close = weakref.finalize(self, _end, self._process, self._errors)
 
     def ask(self, message: Message, seconds: float) -> Message:
         """Sends a message and waits for the reply.
@@ -86,130 +76,103 @@ class Program:
         if not self.close.alive:
             raise PolicyError(f"the program {self.command!r} has ended")
         try:
-            answer = decode(self._exchange(encode(message), time.monotonic() + seconds))
-            self._check_memory()
-            return answer
+            return self._exchange(encode(message), time.monotonic() + seconds)
         except TimeoutError:
             reason = f"did not reply to `{message.kind}` within {seconds:g} s"
         except MemoryError as error:
             reason = str(error)
-        except EOFError as error:
-            reason = self._death(str(error))
+        except (EOFError, BrokenPipeError):
+            reason = self._death()
         except MessageError as error:
             reason = f"did not reply to `{message.kind}`: {error}"
+        said = self._last_words()
         self.close()
-        said = " ".join(self._said.decode("utf-8", "replace").split())
-        last = f"; its standard error ends with: {said[-600:]}" if said else ""
-        raise PolicyError(f"the program {self.command!r} {reason}{last}")
+        raise PolicyError(f"the program {self.command!r} {reason}{said}")
 
-    def _exchange(self, data: bytes, end: float) -> bytes:
-        """Writes and reads at the same time, so that neither side blocks the other.
+    def _exchange(self, data: bytes, end: float) -> Message:
+        """Sends bytes and returns the reply, measuring memory meanwhile.
 
         Raises:
             TimeoutError: `end` on the monotonic clock has passed.
-            EOFError: the program has closed its `input` or its `output`, as the text says.
             MemoryError: the program takes more than allowed.
-            MessageError: the bytes are not a message, or come before the request is sent.
+            EOFError, BrokenPipeError: it has closed its input or output.
+            MessageError: the reply is not a message.
         """
-        streams = self._process.stdin, self._process.stdout, self._process.stderr
-        into, out, errors = (pipe.fileno() for pipe in streams if pipe is not None)
-        left, inbox = memoryview(data), bytearray()
-        measured = time.monotonic()
-        with selectors.DefaultSelector() as selector:
-            selector.register(into, selectors.EVENT_WRITE)
-            selector.register(out, selectors.EVENT_READ)
-            selector.register(errors, selectors.EVENT_READ)
-            while True:
-                if (patience := end - time.monotonic()) <= 0.0:
-                    raise TimeoutError
-                ready = {key.fd for key, _ in selector.select(min(patience, _MEASURE_EVERY))}
-                if time.monotonic() - measured > _MEASURE_EVERY:
-                    self._check_memory()
-                    measured = time.monotonic()
-                if errors in ready and not self._listen(errors):
-                    selector.unregister(errors)
-                if out in ready:
-                    inbox += (chunk := os.read(out, _CHUNK))
-                    if _is_whole(inbox, not left):
-                        return bytes(inbox)
-                    if not chunk:
-                        raise EOFError("output")
-                elif (
-                    into in ready
-                ):  # a reply counts first: the program may close its input afterwards
-                    if not left:
-                        raise EOFError("input")
-                    left = left[_write(into, left) :]
-                    if (
-                        not left
-                    ):  # nothing is read from it: it becomes ready when the other end is closed
-                        selector.modify(into, selectors.EVENT_READ)
+        replies = queue.SimpleQueue[Message | Exception]()
+        # In a thread, so that no program can block the loop: it ends with the pipes.
+        threading.Thread(target=_talk, args=(self._process, data, replies), daemon=True).start()
+        reply = None
+        while reply is None:
+            left = end - time.monotonic()
+            with contextlib.suppress(queue.Empty):
+                reply = replies.get(timeout=max(0.0, min(left, _MEASURE_EVERY)))
+            self._check_memory()
+            if reply is None and left <= 0.0:
+                raise TimeoutError
+        if isinstance(reply, Exception):
+            raise reply
+        return reply
 
     def _check_memory(self) -> None:
-        """Checks the total memory of its processes, which limits per process do not bound.
+        """Measures the memory of its processes together.
 
         Raises:
-            MemoryError: the program and its child processes take more than allowed.
+            MemoryError: they take more than allowed.
         """
-        if not self._memory or not IS_LINUX:
+        if not self._memory:
             return
-        taken = sum(_size(one) for one in _family(self._process.pid))
+        taken = sum(map(_size, _family(self._process.pid))) / (1 << 30)
         if taken > self._memory:
             raise MemoryError(
-                f"takes {taken / (1 << 30):.2f} GiB with its child processes, the limit is "
-                f"{self._memory / (1 << 30):g} GiB"
+                f"takes {taken:.2f} GiB with its child processes, the limit is {self._memory:g} GiB"
             )
 
-    def _listen(self, errors: int) -> bool:
-        """Reads its standard error and keeps the last bytes; False at its end."""
-        said = os.read(errors, _CHUNK)
-        self._said = (self._said + said)[-_TAIL:]
-        return bool(said)
-
-    def _death(self, closed: str) -> str:
-        """Describes how the program ended, or that it only closed its `input` or `output`."""
+    def _death(self) -> str:
+        """Describes how the program ended, or that it only closed its input or output."""
         code = _wait(self._process)
-        assert self._process.stderr is not None
-        with contextlib.suppress(BlockingIOError):
-            while self._listen(self._process.stderr.fileno()):
-                pass
         if code is None:
-            return f"closed its {closed} but kept running"
+            return "closed its input or output but kept running"
         if code < 0:
             return f"was killed by {signal.Signals(-code).name}, perhaps because of its memory"
         return f"ended with code {code}"
 
-
-def _is_whole(inbox: bytearray, asked: bool) -> bool:
-    """Checks whether a complete message has arrived; `asked`: the request has been sent.
-
-    Raises:
-        MessageError: too long, more than one, or before the request.
-    """
-    is_short = len(inbox) < PREFIX.size
-    missing = (PREFIX.size if is_short else length_of(bytes(inbox[: PREFIX.size]))) - len(inbox)
-    if missing < 0:
-        raise MessageError(f"{-missing} bytes more than one message were sent")
-    if inbox and not asked:  # taken for the reply, it would shift all later ones by one
-        raise MessageError(
-            f"it sent {len(inbox)} bytes before the request: send one message per request, "
-            "after reading it, and print to the standard error"
-        )
-    return missing == 0
+    def _last_words(self) -> str:
+        """Quotes the end of its standard error, if it wrote something there."""
+        self._errors.seek(max(0, self._errors.seek(0, 2) - _TAIL))
+        said = " ".join(self._errors.read().decode("utf-8", "replace").split())
+        return f"; its standard error ends with: {said}" if said else ""
 
 
-def _write(into: int, left: memoryview) -> int:
-    """Writes as much as the pipe accepts.
-
-    Raises:
-        EOFError: the other end is closed.
-    """
+def _talk(
+    process: "subprocess.Popen[bytes]",
+    data: bytes,
+    replies: "queue.SimpleQueue[Message | Exception]",
+) -> None:
+    """Writes a message, reads the reply, and puts it or the error into a queue."""
+    assert process.stdin is not None
+    assert process.stdout is not None
     try:
-        return os.write(into, left[:_CHUNK])
-    except BlockingIOError:
-        return 0
-    except BrokenPipeError:
-        raise EOFError("input") from None
+        left = memoryview(data)
+        while left:
+            left = left[process.stdin.write(left) :]
+        prefix = _read(process.stdout, PREFIX.size)
+        replies.put(decode(prefix + _read(process.stdout, length_of(prefix) - PREFIX.size)))
+    except Exception as error:  # raised again by the thread that waits
+        replies.put(error)
+
+
+def _read(stream: IO[bytes], count: int) -> bytes:
+    """Reads so many bytes.
+
+    Raises:
+        EOFError: there are fewer.
+    """
+    data = bytearray()
+    while len(data) < count:
+        if not (chunk := stream.read(count - len(data))):
+            raise EOFError
+        data += chunk
+    return bytes(data)
 
 
 def _wait(process: "subprocess.Popen[bytes]") -> int | None:
@@ -219,32 +182,19 @@ def _wait(process: "subprocess.Popen[bytes]") -> int | None:
     return None
 
 
-def _end(process: "subprocess.Popen[bytes]") -> None:
-    """Stops a program, its group, and its descendants."""
+def _end(process: "subprocess.Popen[bytes]", errors: IO[bytes]) -> None:
+    """Stops a program and its child processes, and closes its files."""
     started = _family(process.pid)
-    for pipe in (process.stdin, process.stdout):
-        assert pipe is not None
-        pipe.close()
+    assert process.stdin is not None
+    process.stdin.close()
     _wait(process)  # the end of its input tells it to exit
-    with contextlib.suppress(ProcessLookupError, PermissionError):
-        os.killpg(process.pid, signal.SIGKILL)
     for one in [*started, *_family(process.pid)]:
         with contextlib.suppress(psutil.Error):
             one.kill()
     process.wait()
-    assert process.stderr is not None
-    process.stderr.close()
-
-
-def _limit_memory(pid: int, memory: int) -> None:
-    """Limits each process of a program that has just started [bytes]; 0: no limit."""
-    if not memory or not IS_LINUX:
-        return
-    with contextlib.suppress(psutil.Error):
-        # Not the address space: GPUs and sparse tables reserve much more than they use. Files in
-        # memory (/dev/shm, memfd) count for no process: their size is limited, too.
-        for limit in (psutil.RLIMIT_DATA, psutil.RLIMIT_FSIZE):
-            psutil.Process(pid).rlimit(limit, (memory, memory))
+    assert process.stdout is not None
+    process.stdout.close()
+    errors.close()
 
 
 def _family(pid: int) -> list[psutil.Process]:
@@ -256,7 +206,9 @@ def _family(pid: int) -> list[psutil.Process]:
 
 
 def _size(process: psutil.Process) -> int:
-    """Measures the memory of a process, with its proportion of shared pages [bytes]."""
+    """Measures the memory of a process [bytes]."""
     with contextlib.suppress(psutil.Error):
-        return int(process.memory_full_info().pss)
+        taken = process.memory_full_info()
+        # On Linux shared pages count by their share, elsewhere once for each process.
+        return int(getattr(taken, "pss", taken.rss))
     return 0
