@@ -1,119 +1,27 @@
-"""The pure-JAX rasterizer against the readable one: images, all gradients, and rough input."""
+"""The pure-JAX rasterizer alone: batches, `vmap` and `scan`, memory, and how often it compiles."""
 
 import dataclasses
 from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from r3jax.geometry.cameras import Camera, look_at
 from r3jax.splatting.backend import RasterConfig
-from r3jax.splatting.backends import reference, xla
-from tests.splatting.clouds import random_cloud, safe_pixels, view
-
-COUNT, SIZE, BUDGET = 120, (50, 38), 1 << 12
-CONFIG = RasterConfig(max_intersections=BUDGET, tiles_per_batch=4, gaussians_per_chunk=16)
-
-
-def composite(rasterize, scene, camera, pose, offsets=None, config=CONFIG):
-    offsets = jnp.zeros((scene.capacity, 2)) if offsets is None else offsets
-    return rasterize(scene, camera, pose, offsets, config)
-
-
-def weighted_sum(weights, *arguments):
-    """A loss with another weight for every pixel of every image."""
-    result = composite(*arguments)
-    images = result.rgb, result.depth_sum, result.alpha
-    return sum(jnp.sum(image * weight) for image, weight in zip(images, weights, strict=True))
-
-
-render_with = eqx.filter_jit(composite)
-gradients_with = eqx.filter_jit(
-    lambda weights, rasterize, variables: jax.grad(
-        lambda variables: weighted_sum(weights, rasterize, *variables)
-    )(variables)
+from r3jax.splatting.backends import xla
+from tests.splatting.backends.agreement import (
+    ALL,
+    CONFIG,
+    COUNT,
+    SIZE,
+    composite,
+    gradients_with,
+    render_with,
+    solid,
 )
-
-
-def random_weights(seed: int, safe: np.ndarray) -> tuple[jax.Array, ...]:
-    """Weights of the pixels that no threshold decides; 0 elsewhere."""
-    rng = np.random.default_rng(seed)
-    height, width = safe.shape
-    return tuple(
-        jnp.asarray(rng.standard_normal((height, width, *more)) * mask, dtype=jnp.float32)
-        for more, mask in (((3,), safe[..., None]), ((), safe), ((), safe))
-    )
-
-
-ALL = random_weights(0, np.ones(SIZE[::-1], dtype=bool))
-
-
-def solid(seed: int):
-    """Opacities near 1, many layers deep: alpha is cut off at 0.99, pixels end at T = 1e-4."""
-    scene = random_cloud(seed, COUNT)
-    logits, scales = jnp.abs(scene.opacity_logits) * 3.0, scene.log_scales + 0.7
-    return dataclasses.replace(scene, opacity_logits=logits, log_scales=scales)
-
-
-def assert_images_agree(rasterize, scene, camera, pose) -> np.ndarray:
-    safe = safe_pixels(scene, camera, pose)
-    found = render_with(rasterize, scene, camera, pose)
-    expected = render_with(reference.rasterize, scene, camera, pose)
-    assert int(found.overflow) == 0
-    for name, size in (("rgb", 1.0), ("alpha", 1.0), ("depth_sum", 3.0)):
-        difference = np.abs(np.asarray(getattr(found, name) - getattr(expected, name)))
-        assert difference[safe].max(initial=0.0) < 1e-4 * size, name
-    return safe
-
-
-def assert_agrees(rasterize, seed, scene, camera, pose) -> None:
-    """Images on the safe pixels to 1e-4, the gradients by everything to 1e-3."""
-    safe = assert_images_agree(rasterize, scene, camera, pose)
-    assert safe.mean() > 0.6
-    weights = random_weights(seed, safe)
-    variables = (scene, camera, pose, jnp.zeros((scene.capacity, 2)))
-    found = gradients_with(weights, rasterize, variables)
-    expected = gradients_with(weights, reference.rasterize, variables)
-    paths = jax.tree_util.tree_leaves_with_path(expected)
-    for (path, by), ours in zip(paths, jax.tree.leaves(found), strict=True):
-        off, whole = np.linalg.norm(ours - by), np.linalg.norm(by)
-        assert off <= 1e-3 * whole + 1e-6, (jax.tree_util.keystr(path), off, whole)
-
-
-seeds = st.integers(0, 10_000)
-
-
-@pytest.mark.full
-@settings(max_examples=8)
-@given(seeds)
-def test_images_and_gradients_agree(seed):
-    assert_agrees(xla.rasterize, seed, random_cloud(seed, COUNT), *view(*SIZE))
-
-
-@pytest.mark.full
-@settings(max_examples=6)
-@given(seeds)
-def test_solid_clouds_agree(seed):
-    assert_agrees(xla.rasterize, seed, solid(seed), *view(*SIZE))
-
-
-@pytest.mark.full
-@pytest.mark.parametrize("size", [(1, 1), (17, 33)])
-def test_sizes_of_the_image(size):
-    assert_images_agree(xla.rasterize, random_cloud(4, COUNT), *view(*size))
-
-
-@pytest.mark.full
-def test_gaussians_larger_than_the_image():
-    """And a camera in the middle of the cloud, where many lie behind or beside it."""
-    scene, (camera, pose) = random_cloud(5, COUNT), view(*SIZE, distance=0.3)
-    scene = dataclasses.replace(scene, log_scales=scene.log_scales + 2.0)
-    assert_agrees(xla.rasterize, 5, scene, camera, pose)
+from tests.splatting.clouds import random_cloud, view
 
 
 @pytest.mark.full
@@ -144,46 +52,6 @@ def test_sizes_below_one_are_refused():
     config = RasterConfig(gaussians_per_chunk=0)
     with pytest.raises(ValueError, match=r"gaussians_per_chunk.*0"):
         composite(xla.rasterize, random_cloud(1, 2), *view(*SIZE), config=config)
-
-
-def test_overflow_is_counted():
-    scene, (camera, pose) = random_cloud(8, COUNT), view(*SIZE)
-    needed = int(render_with(xla.rasterize, scene, camera, pose).num_intersections)
-    tight = dataclasses.replace(CONFIG, max_intersections=needed - 5)
-    found = render_with(xla.rasterize, scene, camera, pose, None, tight)
-    assert (int(found.num_intersections), int(found.overflow)) == (needed, 5)
-
-
-@pytest.mark.full
-def test_one_gaussian_and_none_in_sight():
-    scene, (camera, pose) = random_cloud(1, 1), view(*SIZE)
-    centered = dataclasses.replace(scene, means=jnp.zeros((1, 3)), opacity_logits=jnp.ones(1))
-    assert_images_agree(xla.rasterize, centered, camera, pose)
-    behind = dataclasses.replace(centered, means=2.0 * pose[None, :3, 3])
-    result = render_with(xla.rasterize, behind, camera, pose)
-    assert float(result.alpha.max()) == float(result.rgb.max()) == 0.0
-    assert int(result.num_intersections) == 0
-    for leaf in jax.tree.leaves(gradients_with(ALL, xla.rasterize, (behind, camera, pose))):
-        assert float(jnp.abs(leaf).max()) == 0.0
-
-
-@settings(max_examples=10)
-@given(seeds, st.sampled_from(["means", "quats", "log_scales", "opacity_logits", "sh"]))
-def test_what_is_not_a_number_is_not_drawn(seed, name):
-    """The image is that of the other Gaussians, and all gradients are finite."""
-    scene, (camera, pose) = random_cloud(seed, COUNT), view(*SIZE)
-    rng = np.random.default_rng(seed)
-    values = np.array(getattr(scene, name)).reshape(COUNT, -1)
-    broken = rng.choice(COUNT, 10, replace=False)
-    values[broken, rng.integers(0, values.shape[1], 10)] = np.nan
-    shape = getattr(scene, name).shape
-    spoiled = dataclasses.replace(scene, **{name: jnp.asarray(values.reshape(shape))})
-    faded = dataclasses.replace(scene, opacity_logits=scene.opacity_logits.at[broken].set(-50.0))
-    found = render_with(xla.rasterize, spoiled, camera, pose)
-    expected = render_with(xla.rasterize, faded, camera, pose)
-    np.testing.assert_array_equal(found.rgb, expected.rgb)
-    for leaf in jax.tree.leaves(gradients_with(ALL, xla.rasterize, (spoiled, camera, pose))):
-        assert np.isfinite(leaf).all()
 
 
 @pytest.mark.full
