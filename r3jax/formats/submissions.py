@@ -33,7 +33,7 @@ from r3jax.runs.header import RunError
 from r3jax.runs.reader import Run
 from r3jax.runs.replay import check_decided_alone
 from r3jax.runs.rows import paths_to, rigid_pose, shortest_floats, table_of
-from r3jax.runs.settings import config_of
+from r3jax.runs.settings import SceneSettings, config_of, scene_of_run
 from r3jax.validation.errors import ForeignFileError, check_version
 from r3jax.validation.files import read_bytes
 from r3jax.validation.json_text import build, check_fields, parse_json
@@ -152,10 +152,11 @@ class Submission:
         return motion_of_record(self.motion)
 
     @property
-    def intrinsics(self) -> Camera:
-        """The camera of every frame."""
-        names = [field.name for field in dataclasses.fields(Camera)]
-        return Camera(**{name: self.camera[name] for name in names})  # pyright: ignore[reportArgumentType]
+    def opened(self) -> SceneSettings:
+        """How its scene is opened, and with which camera."""
+        lens: dict[str, Any] = {name: self.camera[name] for name in _CAMERA}
+        fields = {name: self.scene[name] for name in _SCENE if name != "hash"}
+        return SceneSettings(camera=Camera(**lens), seed=self.seed, **fields)
 
     @property
     def name(self) -> str:
@@ -175,8 +176,7 @@ def submission_of_run(run: Run) -> Submission:
     """Takes the poses out of a recorded run.
 
     Raises:
-        RunError: a run that is not over, or whose views are not one policy's from the scene's own
-            start on.
+        RunError: a run that is not over, or whose views are not one policy's.
     """
     header = run.header
     check_decided_alone(run)
@@ -192,9 +192,7 @@ def submission_of_run(run: Run) -> Submission:
     own = current_name(header.policy["name"]) in HOMES
     # Of the record itself: the policy may be of a package that is not installed here.
     motion = header.policy.get("settings", {}).get("motion")
-    opened: dict[str, Any] = {"up": None, "scale": 1.0, "cull_backfaces": False} | header.scene
-    if missing := [name for name in _SCENE if name not in opened]:
-        raise RunError(run.path, f"an early version recorded it without {', '.join(missing)}")
+    opened = vars(scene_of_run(run)) | {"hash": header.scene.get("hash")}
     return Submission(
         scene={name: opened[name] for name in _SCENE},
         seed=header.seed,
@@ -335,7 +333,7 @@ def _check_parts(header: Submission) -> None:
         if header.exploration.get(name, 0) > largest:
             raise ForeignFileError(f"`exploration.{name}` is more than {largest}")
     try:
-        _ = header.config, header.robot, header.intrinsics
+        _ = header.config, header.robot, header.opened
     except ValueError as error:
         raise ForeignFileError(str(error)) from None
 

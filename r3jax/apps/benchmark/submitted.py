@@ -34,7 +34,7 @@ from r3jax.runs.stored_states import map_tables
 from r3jax.runs.writer import RunWriter
 from r3jax.simulators.base import Simulator
 from r3jax.simulators.free_space import GroundTruth
-from r3jax.simulators.scenes.registry import open_scene, scene_hash
+from r3jax.simulators.scenes.registry import scene_hash
 
 FOLDER = "submissions"
 """Folder of a benchmark for the submissions that it judges."""
@@ -52,26 +52,6 @@ _SAME_PLACE = 2e-3
 
 _SAME_ANGLE = 0.1
 """Angles this close are one [deg]."""
-
-
-def open_submitted(submission: Submission) -> Simulator:
-    """Opens the scene of a submission as it says.
-
-    Raises:
-        ValueError: the scene is unknown, or its file is refused.
-        ImportError: its simulator is not installed.
-    """
-    scene = submission.scene
-    return open_scene(
-        scene["name"],
-        up=scene["up"],
-        scale=scene["scale"],
-        cull_back_faces=scene["cull_backfaces"],
-        camera=submission.intrinsics,
-        noise=scene["noise"],
-        seed=submission.seed,
-        max_range=scene["max_range"],
-    )
 
 
 @dataclass(frozen=True)
@@ -97,7 +77,7 @@ def problems_of(submission: Submission) -> list[Problem]:
             raise InputError("a model is trained on two frames at least, and there is one")
         submission.config.check_scales()
         _ = conditions_of(submission, Conditions(train_resolution=16)).train_config(submission.seed)
-        simulator = open_submitted(submission)
+        simulator = submission.opened.open()
         check_world(simulator.bounds, submission.config.cell_size, "`exploration.cell_size`")
         return check_submission(submission, simulator)
     except (ValueError, ImportError) as error:
@@ -149,36 +129,45 @@ def _check_frames(submission: Submission, start: np.ndarray) -> Iterator[Problem
         start: where its scene is to be begun, [4, 4].
     """
     config, budget = submission.config, parse_budget(submission.budget)
-    # A little less, for rounding.
-    longest = config.piece_at(submission.robot.speed or config.speed) * (1.0 - 1e-4)
+    speed = submission.robot.speed or config.speed
+    costs = model_clock(config).costs if config.clock == "model" else {}
+    longest = config.piece_at(speed) * (1.0 - 1e-4)
     before, pose, metres, views = None, start, 0.0, 0
     captured, way = 0, 0.0
     for frame, path in zip(submission.frames, submission.paths(), strict=True):
         length = _length(path)
         flown = metres + length if frame.metres is None else frame.metres
-        texts = [*check_times(submission, before, frame, flown - metres, length)]
+        needed, mapping = max(flown - metres, length) / speed, costs.get("mapping", 0.0)
+        if not (before is None or before.captured):  # what follows a capture was decided before it
+            needed += costs.get("reconsidering" if config.plan_while_moving else "planning", 0.0)
+        arrival = frame.seconds - frame.mapping
+        taken = arrival - (0.0 if before is None else before.seconds)
         gap = np.linalg.norm(path[[0, -1]] - np.stack([pose[:3, 3], frame.position]), axis=1).max()
         turned = math.degrees(angle_between(frame.pose.astype(np.float64), pose))
-        if gap > _SAME_PLACE or (before is None and turned > _SAME_ANGLE):
-            texts.append(
-                f"its path ends {gap:.3f} m from a view, turned by {turned:.2f} degrees: begin at "
-                "the scene's start, and lead from view to view"
-            )
         # A frame captured while moving belongs to the view that it was captured before.
-        arrival = frame.seconds - frame.mapping
-        spent = {"views": views + 1, "frames": frame.frame + 1, "seconds": arrival, "metres": flown}
-        if not budget.allows(**spent):  # pyright: ignore[reportArgumentType]
-            over = f"it takes {spent[budget.unit]:g} {budget.unit}, beyond the budget {budget}"
-            texts.append(format_budget(f"{over}: end before it"))
+        spent: dict[str, Any] = {
+            "views": views + 1, "frames": frame.frame + 1, "seconds": arrival, "metres": flown,
+        }  # fmt: skip
         # The loop cuts a path into the fewest equal pieces that are not too long, and captures a
         # frame between two of them. A budget of views does not count these.
         captured, way = captured + frame.captured, way + length
-        if captured and captured >= way / longest + frame.captured:
-            texts.append(
-                f"{captured} frames are captured on {way:.3f} m: at the most one on {longest:.3g} m"
-                ", by `capture_every` or `capture_rate` in line 1"
-            )
-        yield from (Problem(frame.frame, text) for text in texts)
+        rules = {
+            f"`metres` grows by {flown - metres:.4f}, the path has {length:.4f} m: count all of it":
+                flown - metres < _less(length),
+            f"`seconds` leaves {taken:.4f} s for deciding and {length:.3f} m at {speed:g} m/s, "
+            f"which take {needed:.4f} s: count all of them": taken < _less(needed),
+            f"`mapping` is {frame.mapping:g} s, it takes {mapping:g} s or more":
+                frame.mapping < _less(mapping),
+            f"its path ends {gap:.3f} m from a view, turned by {turned:.2f} degrees: begin at the "
+            "scene's start, and lead from view to view":
+                gap > _SAME_PLACE or (before is None and turned > _SAME_ANGLE),
+            format_budget(f"it takes {spent[budget.unit]:g} {budget.unit}, beyond the budget "
+                          f"{budget}: end before it"): not budget.allows(**spent),
+            f"{captured} frames are captured on {way:.3f} m: at the most one on {longest:.3g} m, "
+            "by `capture_every` or `capture_rate` in line 1":
+                captured > 0 and captured >= way / longest + frame.captured,
+        }  # fmt: skip
+        yield from (Problem(frame.frame, told) for told, is_broken in rules.items() if is_broken)
         before, pose, metres = frame, frame.pose.astype(np.float64), flown
         if not frame.captured:
             captured, way, views = 0, 0.0, views + 1
@@ -187,38 +176,6 @@ def _check_frames(submission: Submission, start: np.ndarray) -> Iterator[Problem
 def _length(path: np.ndarray) -> float:
     """Computes the length of a path [m]."""
     return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
-
-
-def check_times(
-    submission: Submission,
-    before: SubmittedFrame | None,
-    frame: SubmittedFrame,
-    flown: float,
-    length: float,
-) -> Iterator[str]:
-    """Yields a problem where the clock leaves too little time to decide, to fly and to map."""
-    config, motion = submission.config, submission.robot
-    costs = model_clock(config).costs if config.clock == "model" else {}
-    taken = frame.seconds - frame.mapping - (0.0 if before is None else before.seconds)
-    needed = max(flown, length) / (motion.speed or config.speed)
-    if before is not None:
-        turn = math.degrees(angle_between(before.pose.astype(float), frame.pose.astype(float)))
-        turning = 0.0 if motion.turn_rate is None else turn / motion.turn_rate
-        # Between captured frames the camera turns while it flies; to a view it flies first.
-        is_whole = not (frame.captured or before.captured)
-        needed = needed + turning if is_whole else max(needed, turning)
-        if not before.captured:  # what follows a captured frame was decided before it
-            needed += costs.get("reconsidering" if config.plan_while_moving else "planning", 0.0)
-    if frame.mapping < _less(costs.get("mapping", 0.0)):
-        yield f"`mapping` is {frame.mapping:g} s, it takes {costs.get('mapping', 0.0):g} s or more"
-    if flown < _less(length):
-        yield f"`metres` grows by {flown:.4f}, the path has {length:.4f} m: count all of it"
-    if taken < _less(needed):
-        speed = motion.speed or config.speed
-        yield (
-            f"`seconds` leaves {taken:.4f} s for deciding, {length:.3f} m at {speed:g} m/s and the "
-            f"turn, which take {needed:.4f} s: count all of them"
-        )
 
 
 def _less(value: float) -> float:
