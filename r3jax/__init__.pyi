@@ -35,7 +35,7 @@ from .planning.rebuild import rebuild
 from .planning.registry import make_policy, register_policy
 from .planning.robot.body import Body
 from .runs.saved_planner import load, save
-from .scoring.config import ScoringConfig
+from .scoring.config import CellImportance, ScoringConfig
 from .scoring.explain import Explanation, explain_view
 from .scoring.panorama import Panorama, panorama
 from .scoring.renderability import (
@@ -60,6 +60,7 @@ __version__: str
 __all__ = [
     "Body",
     "Camera",
+    "CellImportance",
     "Decision",
     "DecisionOutcome",
     "ErrorImages",

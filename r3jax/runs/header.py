@@ -16,6 +16,7 @@ from r3jax.geometry.cameras import Camera
 from r3jax.planning.policies import HOMES
 from r3jax.planning.policy import LivesOutside, Policy
 from r3jax.planning.robot.motion import Motion
+from r3jax.scoring.config import function_name
 from r3jax.validation.errors import ForeignFileError, VersionError, check_version
 from r3jax.validation.files import check_relative, read_bytes
 from r3jax.validation.images import MAX_PIXELS
@@ -109,6 +110,8 @@ def camera_fields(camera: Camera) -> dict[str, int | float]:
 
 def plain_settings(settings: Any) -> Any:
     """Converts nested settings (dataclasses, modules, arrays) to plain values for JSON."""
+    if callable(settings):
+        return function_name(settings)
     # vars, not asdict: that would copy arrays and stop at modules.
     if isinstance(settings, eqx.Module) or dataclasses.is_dataclass(settings):
         return {name: plain_settings(value) for name, value in vars(settings).items()}
@@ -136,7 +139,7 @@ def settings_of(policy: object) -> dict[str, Any]:
     """Returns the settings of a policy that JSON can contain.
 
     Settings with the meaning of earlier versions are left out: the motion of a free-flying camera,
-    no refinement, and a camera that turns by itself.
+    no refinement, the paper's R, and a camera that turns by itself.
     """
     settings = plain_settings(getattr(policy, "config", {}))
     # Left out if it has no effect, so that earlier headers stay equal.
@@ -146,6 +149,9 @@ def settings_of(policy: object) -> dict[str, Any]:
         del settings["motion"]["fixed_camera"]
     if settings.get("refine") == 0:
         del settings["refine"], settings["refine_radius"]
+    if "scoring" in settings:
+        plain = settings["scoring"].items()
+        settings["scoring"] = {name: value for name, value in plain if value is not None}
     return settings
 
 

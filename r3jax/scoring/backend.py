@@ -8,6 +8,7 @@ and every cell; h w pixels of a depth buffer.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -17,10 +18,10 @@ from jaxtyping import Array, Float, Int, UInt8
 
 from r3jax.kernels import calls
 from r3jax.kernels.calls import Cells, Forms
-from r3jax.kernels.native.platform import call_of_many
+from r3jax.kernels.native.platform import call_of_many, warn_once
 from r3jax.mapping.state import MapState
 from r3jax.scoring import formulas
-from r3jax.scoring.config import ScoringConfig
+from r3jax.scoring.config import Score, ScoringConfig
 from r3jax.visibility.views import View, VisibilityConfig, for_kernels, layout_of
 
 
@@ -68,23 +69,35 @@ def _sums(
     *,
     keep: bool,
 ) -> Any:
-    layout, forms = layout_of(view), config.forms
+    layout, forms = layout_of(view), config.score.forms
 
-    def kernel(known: tuple[MapState, Cells], items: Any) -> tuple[Array, ...]:
-        (voxels, cells), views = known, jax.vmap(for_kernels)(*items)
+    def kernel(known: tuple[MapState, Cells, Score], items: Any) -> tuple[Array, ...]:
+        (voxels, cells, _), views = known, jax.vmap(for_kernels)(*items)
         return calls.sums(
             voxels.rows, cells, views, layout, forms, num_bins, voxels.num_bins, keep=keep
         )
 
-    def formula(known: tuple[MapState, Cells], item: Any) -> tuple[Array, ...]:
-        (voxels, cells), (view, tolerance, focal) = known, item
+    def formula(known: tuple[MapState, Cells, Score], item: Any) -> tuple[Array, ...]:
+        (voxels, cells, score), (view, tolerance, focal) = known, item
         seen = formulas.seen_in_view(voxels, cells, view, VisibilityConfig(tolerance=tolerance))
         position = for_kernels(*item).position
-        sums = formulas.sums_of_seen(voxels, cells, seen, position, focal, forms, num_bins)
+        sums = formulas.sums_of_seen(voxels, cells, seen, position, focal, score, num_bins)
         return (*sums, *map(jnp.packbits, seen)) if keep else sums
 
     item = (view, config.tolerance, focal)
-    return call_of_many(kernel, formula, (voxels, cells), item, voxels.capacity)
+    known = (voxels, cells, config.score)
+    return call_of_many(_if_any(kernel, config.score), formula, known, item, voxels.capacity)
+
+
+def _if_any(kernel: Callable[..., Any], score: Score) -> Callable[..., Any] | None:
+    """Returns the kernel, or None where R is the caller's own, with a warning."""
+    if score.has_kernel:
+        return kernel
+    warn_once(
+        "ScoringConfig has a combination of terms or an importance of its own, for which there is "
+        "no machine code: scores are computed in plain JAX, which is slower"
+    )
+    return None
 
 
 def change_of_sums(
@@ -97,10 +110,10 @@ def change_of_sums(
     num_bins: int,
 ) -> tuple[Float[Array, " B"], Float[Array, " B"]]:
     """Computes `formulas.change_of_sums`."""
-    forms = config.forms
+    forms = config.score.forms
 
     def kernel(known: Any, items: Any) -> tuple[Array, Array]:
-        (voxels, cells), (voxels_after, cells_after) = known
+        (voxels, cells), (voxels_after, cells_after), _ = known
         gone = cells._replace(unexplored=cells.unexplored & ~cells_after.unexplored)
         kept, position, focal = items
         return calls.changes(
@@ -109,45 +122,45 @@ def change_of_sums(
         )  # fmt: skip
 
     def formula(known: Any, item: Any) -> tuple[Array, Array]:
-        (before, after), (kept, position, focal) = known, item
-        return formulas.change_of_sums(before, after, kept, position, focal, forms, num_bins)
+        (before, after, score), (kept, position, focal) = known, item
+        return formulas.change_of_sums(before, after, kept, position, focal, score, num_bins)
 
-    item = (kept, position, focal)
-    return call_of_many(kernel, formula, (before, after), item, before[0].capacity)
+    item, known = (kept, position, focal), (before, after, config.score)
+    return call_of_many(_if_any(kernel, config.score), formula, known, item, before[0].capacity)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(5,))
+@jax.custom_jvp
 def mean_in_pixels(
     voxels: MapState,
     view: View,
     position: Float[Array, " 3"],
     focal: Float[Array, ""],
     config: ScoringConfig,
-    forms: Forms,
 ) -> Float[Array, ""]:
     """Computes `formulas.mean_in_pixels`."""
     del position  # that of the view; it only carries the derivative
-    layout = layout_of(view)
+    layout, forms = layout_of(view), config.score.forms
 
-    def kernel(voxels: MapState, items: Any) -> Array:
-        views, bins = jax.vmap(for_kernels)(*items), voxels.num_bins
+    def kernel(known: tuple[MapState, Score], items: Any) -> Array:
+        voxels, views = known[0], jax.vmap(for_kernels)(*items)
+        bins = voxels.num_bins
         return calls.pixels(voxels.rows, views, layout, forms, bins, keep=False)[0]
 
-    def formula(voxels: MapState, item: Any) -> Array:
+    def formula(known: tuple[MapState, Score], item: Any) -> Array:
         position = for_kernels(*item).position
-        return formulas.mean_in_pixels(voxels, item[0], position, item[2], forms)
+        return formulas.mean_in_pixels(known[0], item[0], position, item[2], known[1])
 
-    item = (view, config.tolerance, focal)
-    return call_of_many(kernel, formula, voxels, item, voxels.capacity)
+    item, known = (view, config.tolerance, focal), (voxels, config.score)
+    return call_of_many(_if_any(kernel, config.score), formula, known, item, voxels.capacity)
 
 
 @mean_in_pixels.defjvp
-def _mean_in_pixels_jvp(forms: Forms, primals: Any, tangents: Any) -> Any:
+def _mean_in_pixels_jvp(primals: Any, tangents: Any) -> Any:
     voxels, view, position, focal, config = primals
     rows = rows_in_pixels(voxels, view, config)
 
     def score(voxels: MapState, position: Array, focal: Array) -> Array:
-        return formulas.mean_of_rows(voxels, rows, position, focal, forms)
+        return formulas.mean_of_rows(voxels, rows, position, focal, config.score)
 
     moved = tangents[0], tangents[2], tangents[3]
     return jax.jvp(score, (voxels, position, focal), moved)

@@ -91,7 +91,7 @@ def _at_hand(
     """Returns the whole map and grid if a kernel culls them itself, else the rows within range."""
     if is_traced(state.key, positions):
         raise TypeError("score_views and score_positions distribute work: call them outside jit")
-    if jax.default_backend() == "cpu" and can_call_kernels():
+    if config.score.has_kernel and jax.default_backend() == "cpu" and can_call_kernels():
         return state, _cells_of(grid)
     voxels, cells, _ = gather_in_range(state, grid, positions, config)
     return voxels, cells
@@ -109,8 +109,15 @@ def score_views_near(
 ) -> ViewUtility:
     """Computes `score_views` of voxels and cells that `near` gathered."""
     return map_over_devices(
-        functools.partial(_score_views, voxels, cells, camera, config), poses, threads=1
+        functools.partial(_score_views, voxels, cells, camera, config),
+        poses,
+        threads=_threads(config),
     )
+
+
+def _threads(config: ScoringConfig) -> int | None:
+    """Returns 1 where a kernel uses all cores itself."""
+    return 1 if config.score.has_kernel else None
 
 
 def score_positions_near(
@@ -123,7 +130,8 @@ def score_positions_near(
 ) -> Panorama:
     """Computes `score_positions` of voxels and cells that `near` gathered."""
     score = functools.partial(_score_positions, voxels, cells, camera, config)
-    return map_over_devices(score, (positions, _all_if_none(allowed, positions, config)), threads=1)
+    places = (positions, _all_if_none(allowed, positions, config))
+    return map_over_devices(score, places, threads=_threads(config))
 
 
 def cache_positions_near(
@@ -136,7 +144,8 @@ def cache_positions_near(
 ) -> tuple[Panorama, PanoramaCache]:
     """Computes `score_positions_near`, and caches what `score_cached_near` needs."""
     score = functools.partial(_cache_positions, voxels, cells, camera, config)
-    return map_over_devices(score, (positions, _all_if_none(allowed, positions, config)), threads=1)
+    places = (positions, _all_if_none(allowed, positions, config))
+    return map_over_devices(score, places, threads=_threads(config))
 
 
 def score_cached_near(

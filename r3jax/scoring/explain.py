@@ -21,7 +21,7 @@ from r3jax.geometry.selection import for_selected
 from r3jax.mapping.occupancy import OccupancyGrid, a_grid, cells_of
 from r3jax.mapping.seen import seen_in_view
 from r3jax.mapping.state import MapState, a_map
-from r3jax.scoring.config import Forms, ScoringConfig, scoring_settings
+from r3jax.scoring.config import Score, ScoringConfig, scoring_settings
 from r3jax.scoring.terms import score_voxels
 from r3jax.visibility.views import pinhole_view
 
@@ -78,7 +78,7 @@ def explain_view(
     # The steps of `view_utility`, one by one: the parts must sum to its total.
     shown, unseen = seen_in_view(state, cells_of(grid), view, config)
     position = T_world_camera[:3, 3]
-    shares, rendering = _divide_visible(state, shown, position, camera.focal, config.forms)
+    shares, rendering = _divide_visible(state, shown, position, camera.focal, config.score)
     exploration = config.lambda1 * jnp.sum(unseen, dtype=jnp.float32)
     factor = nan_unless_valid(camera, T_world_camera, state.voxel_size, grid.cell_size)
     return Explanation(
@@ -94,16 +94,20 @@ def _divide_visible(
     visible: Bool[Array, " N"],
     position: Float[Array, " 3"],
     focal: Float[Array, ""],
-    forms: Forms,
+    score: Score,
 ) -> _Sums:
     """Attributes the deficits of the visible voxels to causes, summed in the order of U_R."""
     num = voxels.capacity
 
     def add(index: Int[Array, " K"], valid: Bool[Array, " K"], sums: _Sums) -> _Sums:
         shares, totals = sums
-        terms = score_voxels(voxels.take(index, valid), position, focal, forms)
+        some = voxels.take(index, valid)
+        terms = score_voxels(some, position, focal, score)
         factors = jnp.stack([terms.bias, terms.noise, terms.resolution])
-        part = jnp.where(valid[None, :], attribute_deficit(1.0 - terms.value, factors), 0.0)
+        deficit = 1.0 - terms.value
+        if score.importance is not None:
+            deficit *= score.importance(some)
+        part = jnp.where(valid[None, :], attribute_deficit(deficit, factors), 0.0)
         target = jnp.where(valid, index, num)  # out of range, so dropped
         return shares.at[:, target].set(part, mode="drop"), totals + jnp.sum(part, axis=1)
 
@@ -117,10 +121,10 @@ def attribute_deficit(
     """Attributes the deficit 1 - prod(f) to the factors, in proportion to -log f.
 
     share of f = deficit log(f) / sum of the logarithms. Factors of 0 share the deficit equally, and
-    the others get nothing.
+    the others get nothing; so do factors that are all 1.
 
     Args:
-        deficit: 1 - the product of the factors.
+        deficit: 1 - the product of the factors, or another function of them.
         factors: each in [0, 1].
 
     Returns:
@@ -130,5 +134,6 @@ def attribute_deficit(
     cost = -jnp.log(jnp.where(is_zero, 1.0, factors))
     weight = jnp.where(jnp.any(is_zero, axis=0)[None, :], is_zero.astype(factors.dtype), cost)
     total = jnp.sum(weight, axis=0)
-    # The deficit is 0 where all weights are 0, and 0 / 0 must not become NaN.
-    return weight * (deficit / jnp.where(total > 0.0, total, 1.0))[None, :]
+    # Where all factors are 1 their product leaves no deficit; another function of them may.
+    weight = jnp.where(total > 0.0, weight, 1.0)
+    return weight * (deficit / jnp.where(total > 0.0, total, float(len(factors))))[None, :]

@@ -16,8 +16,8 @@ from r3jax.geometry.numerics import safe_norm
 from r3jax.geometry.sphere import nearest_bin
 from r3jax.kernels.calls import Cells
 from r3jax.mapping.state import MapState
-from r3jax.scoring.config import Forms, ScoringConfig
-from r3jax.scoring.terms import score_voxels
+from r3jax.scoring.config import Score, ScoringConfig
+from r3jax.scoring.terms import deficits, score_voxels
 from r3jax.visibility.depth_buffer import depth_buffer, visible
 from r3jax.visibility.views import View, VisibilityConfig
 
@@ -43,7 +43,7 @@ def sums_in_view(
         num_bins: bins of the Fibonacci lattice; 1 sums over all directions.
     """
     seen, empty = seen_in_view(voxels, cells, view, config)
-    return sums_of_seen(voxels, cells, (seen, empty), position, focal, config.forms, num_bins)
+    return sums_of_seen(voxels, cells, (seen, empty), position, focal, config.score, num_bins)
 
 
 def sums_of_seen(
@@ -52,11 +52,11 @@ def sums_of_seen(
     seen: tuple[Bool[Array, " n"], Bool[Array, " c"]],
     position: Float[Array, " 3"],
     focal: Float[Array, ""],
-    forms: Forms,
+    score: Score,
     num_bins: int,
 ) -> tuple[Float[Array, " B"], Float[Array, " B"]]:
     """Computes `sums_in_view` for known visibility."""
-    deficit = 1.0 - score_voxels(voxels, position, focal, forms).value
+    deficit = deficits(voxels, position, focal, score)
     deficit, unexplored = jnp.where(seen[0], deficit, 0.0), seen[1].astype(jnp.float32)
     points = jnp.stack([cells.x, cells.y, cells.z])
     return (
@@ -71,7 +71,7 @@ def change_of_sums(
     kept: Sequence[UInt8[Array, " _"]],
     position: Float[Array, " 3"],
     focal: Float[Array, ""],
-    forms: Forms,
+    score: Score,
     num_bins: int,
 ) -> tuple[Float[Array, " B"], Float[Array, " B"]]:
     """Computes how imagined views change `sums_in_view`; visibility stays the same.
@@ -82,7 +82,7 @@ def change_of_sums(
         kept: visible voxels and cells, as bits in bytes.
         position: of the camera [m].
         focal: focal length of R [px].
-        forms: of kappa and delta.
+        score: how R is computed.
         num_bins: bins of the Fibonacci lattice.
 
     Returns:
@@ -93,9 +93,7 @@ def change_of_sums(
         jnp.unpackbits(bits, count=num).astype(bool)
         for bits, num in zip(kept, (voxels.capacity, cells.x.shape[0]), strict=True)
     )
-    deficit, left = (
-        1.0 - score_voxels(known, position, focal, forms).value for known in (voxels, voxels_after)
-    )
+    deficit, left = (deficits(known, position, focal, score) for known in (voxels, voxels_after))
     # An imagined view adds to the count of just the voxels that it shows.
     shown = seen & (voxels_after.count > voxels.count)
     explored = empty & cells.unexplored & ~cells_after.unexplored
@@ -125,10 +123,10 @@ def mean_in_pixels(
     view: View,
     position: Float[Array, " 3"],
     focal: Float[Array, ""],
-    forms: Forms,
+    score: Score,
 ) -> Float[Array, ""]:
     """Averages R over the pixels of a view; pixels without a voxel count as 0."""
-    return mean_of_rows(voxels, rows_in_pixels(voxels, view), position, focal, forms)
+    return mean_of_rows(voxels, rows_in_pixels(voxels, view), position, focal, score)
 
 
 def mean_of_rows(
@@ -136,11 +134,18 @@ def mean_of_rows(
     rows: Int[Array, "h w"],
     position: Float[Array, " 3"],
     focal: Float[Array, ""],
-    forms: Forms,
+    score: Score,
 ) -> Float[Array, ""]:
-    """Averages R over the pixels of an image; pixels without a voxel count as 0."""
+    """Averages R over the pixels of an image; pixels without a voxel count as 0.
+
+    An importance weighs the pixels; one without a voxel has a weight of 1.
+    """
     shown = voxels_of_rows(voxels, rows)
-    return jnp.mean(score_voxels(shown, position, focal, forms).value)
+    value = score_voxels(shown, position, focal, score).value
+    if score.importance is None:
+        return jnp.mean(value)
+    weight = jnp.where(shown.present, score.importance(shown), 1.0)
+    return jnp.sum(weight * value) / jnp.maximum(jnp.sum(weight), 1e-9)
 
 
 def voxels_of_rows(voxels: MapState, rows: Int[Array, "h w"]) -> MapState:

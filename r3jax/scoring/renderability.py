@@ -5,7 +5,6 @@
 Shape symbols: n voxels; N capacity of the map; h w size of the depth buffer.
 """
 
-import functools
 from collections.abc import Callable
 
 import equinox as eqx
@@ -18,23 +17,24 @@ from jaxtyping import Array, Float, Int
 from r3jax.errors import InputError
 from r3jax.geometry.arguments import a_point, checked
 from r3jax.geometry.cameras import Camera, is_traced, nan_unless_valid
+from r3jax.kernels.calls import Forms
 from r3jax.mapping.state import MapState, a_map
 from r3jax.scoring.backend import mean_in_pixels, rows_in_pixels
-from r3jax.scoring.config import Forms, ScoringConfig, checked_view
+from r3jax.scoring.config import Score, ScoringConfig, checked_view
 from r3jax.scoring.formulas import voxels_of_rows
 from r3jax.scoring.terms import Renderability, score_voxels
 from r3jax.visibility.views import pinhole_view
 
 
-@functools.partial(jax.jit, static_argnames="forms")
+@jax.jit
 def _voxel_renderability(
-    state: MapState, camera_position: Float[Array, " 3"], focal: Float[Array, ""], forms: Forms
+    state: MapState, camera_position: Float[Array, " 3"], focal: Float[Array, ""], score: Score
 ) -> Renderability:
     positive = jnp.stack([focal, state.voxel_size])
     is_valid = jnp.all(jnp.isfinite(positive) & (positive > 0.0))
     is_valid &= jnp.all(jnp.isfinite(camera_position))
     factor = jnp.where(is_valid, 1.0, jnp.nan)
-    terms = score_voxels(state, camera_position, focal, forms)
+    terms = score_voxels(state, camera_position, focal, score)
     return jax.tree.map(lambda term: factor * term, terms)
 
 
@@ -66,7 +66,7 @@ def voxel_renderability(
         raise InputError(f"kappa must be 'box' or 'one', got {kappa!r}")
     if not is_traced(focal) and not 0.0 < float(focal) < np.inf:
         raise InputError(f"focal must be positive and finite [px], got {float(focal)}")
-    return _voxel_renderability(state, position, focal, Forms(kappa))
+    return _voxel_renderability(state, position, focal, Score(Forms(kappa)))
 
 
 class TermImages(eqx.Module):
@@ -104,7 +104,7 @@ def term_images(
     view = pinhole_view(camera, T_world_camera, config)
     row = rows_in_pixels(state, view, config)
     terms = score_voxels(
-        voxels_of_rows(state, row), T_world_camera[:3, 3], camera.focal, config.forms
+        voxels_of_rows(state, row), T_world_camera[:3, 3], camera.focal, config.score
     )
     factor = nan_unless_valid(camera, T_world_camera, state.voxel_size)
     image: Callable[[Array], Array] = lambda term: factor * term.reshape(row.shape)
@@ -147,5 +147,5 @@ def renderability(
     """
     config = ScoringConfig() if config is None else config
     view, position = pinhole_view(camera, T_world_camera, config), T_world_camera[:3, 3]
-    mean = mean_in_pixels(state, view, position, camera.focal, config, config.forms)
+    mean = mean_in_pixels(state, view, position, camera.focal, config)
     return nan_unless_valid(camera, T_world_camera, state.voxel_size) * mean

@@ -33,7 +33,7 @@ from r3jax.mapping.occupancy import OccupancyGrid, a_grid, cells_of
 from r3jax.mapping.seen import seen_in_view
 from r3jax.mapping.state import MapState, a_map
 from r3jax.scoring.config import ScoringConfig, scoring_settings
-from r3jax.scoring.terms import score_voxels
+from r3jax.scoring.terms import deficits, score_voxels
 from r3jax.visibility.views import pinhole_view
 
 MAX_VOXELS, MAX_CELLS = 1 << 12, 1 << 10
@@ -95,10 +95,10 @@ class SoftUtility(eqx.Module):
                 # Distance to the side's plane over that to the camera: a sine, smooth across it.
                 sine = side * (along - k * z) / (distance * jnp.sqrt(1.0 + k * k))
                 visible = visible * jax.nn.sigmoid(sine / self.softness)
-        forms = self.config.forms
-        terms = score_voxels(self.voxels, position, camera.focal, forms, self.kappa_is_one)
-        of_cells = jnp.broadcast_to(self.config.lambda1, x.shape[0] - terms.value.shape[0])
-        return jnp.sum(visible * jnp.concatenate([1.0 - terms.value, of_cells]))
+        score, is_one = self.config.score, self.kappa_is_one
+        of_voxels = deficits(self.voxels, position, camera.focal, score, is_one)
+        of_cells = jnp.broadcast_to(self.config.lambda1, x.shape[0] - of_voxels.shape[0])
+        return jnp.sum(visible * jnp.concatenate([of_voxels, of_cells]))
 
 
 @checked(state=a_map, grid=a_grid, camera=a_camera, T_world_camera=a_pose, config=scoring_settings)
@@ -150,7 +150,7 @@ def soft_utility_near(
     row, num_each = _sample(seen, MAX_VOXELS)
     cell, num_each_cell = _sample(unexplored, MAX_CELLS)
     part, center = voxels.take(row, num_each > 0.0), voxels.center_of(row)
-    terms = score_voxels(part, T_world_camera[:3, 3], camera.focal, config.forms)
+    terms = score_voxels(part, T_world_camera[:3, 3], camera.focal, config.score)
     return SoftUtility(
         points=jnp.stack(
             [jnp.concatenate([center[i], (cells.x, cells.y, cells.z)[i][cell]]) for i in range(3)]

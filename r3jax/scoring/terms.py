@@ -18,11 +18,11 @@ from r3jax.geometry.numerics import safe_norm, safe_power
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.kernels.constants import ON_EDGE
 from r3jax.mapping.state import MapState
-from r3jax.scoring.config import PAPER, Forms
+from r3jax.scoring.config import PAPER, Score
 
 
 class Renderability(eqx.Module):
-    """The terms of one query, per voxel."""
+    """The terms of one query, per voxel; `ScoringConfig` may raise them to a power."""
 
     kappa: Float[Array, " n"]
     """1 between the seen directions, 2 outside their box."""
@@ -62,7 +62,7 @@ def score_voxels(
     voxels: MapState,
     camera_position: Float[Array, " 3"],
     focal: Float[Array, ""],
-    forms: Forms = PAPER,
+    score: Score = PAPER,
     kappa_is_one: Bool[Array, " n"] | None = None,
 ) -> Renderability:
     """Computes the terms of every voxel as seen from one camera position.
@@ -71,16 +71,16 @@ def score_voxels(
         voxels: their statistics.
         camera_position: camera center [m].
         focal: its focal length [px], in the unit used when the map was made.
-        forms: of kappa and delta.
+        score: forms of kappa and delta, powers of the terms, and another R than their product.
         kappa_is_one: whether kappa is 1, if it was determined before; None: computed here.
     """
-    delta = consistency(voxels.count, voxels.m2, forms.delta)
+    delta = consistency(voxels.count, voxels.m2, score.forms.delta)
     # From the voxel to the camera, as the visited bins were recorded.
     offset = camera_position[:, None] - voxels.center
     distance = jnp.maximum(safe_norm(offset, axis=0), 1e-6)
     direction = offset / distance[None, :]
     cosine, inside = seen_directions(voxels.visited, direction, voxels.num_bins)
-    is_one = (inside > 0.0) | (forms.kappa == "one") if kappa_is_one is None else kappa_is_one
+    is_one = (inside > 0.0) | (score.forms.kappa == "one") if kappa_is_one is None else kappa_is_one
     kappa_value = jnp.where(is_one, 1.0, 2.0)
     # kappa is 1 or 2: a product, not a power, whose gradient could be NaN at 0.
     bias = jnp.where(is_one, cosine, cosine * cosine)
@@ -89,8 +89,12 @@ def score_voxels(
     # rho_max / rho with rho = f / d: coming closer than before costs, staying farther does not.
     ratio = jnp.minimum(voxels.resolution * distance / focal, 1.0)
     resolution = safe_power(ratio, 1.0 - delta * bias)
+    bias, noise, resolution = (
+        term if power is None else safe_power(term, jnp.broadcast_to(power, term.shape))
+        for term, power in zip((bias, noise, resolution), score.powers, strict=True)
+    )
     blank: Callable[[Array], Array] = lambda term: jnp.where(voxels.present, term, 0.0)
-    return Renderability(
+    terms = Renderability(
         kappa=kappa_value,
         bias=blank(bias),
         delta=delta,
@@ -98,6 +102,22 @@ def score_voxels(
         resolution=blank(resolution),
         value=blank(bias * noise * resolution),
     )
+    if score.combine is None:
+        return terms
+    own = blank(jnp.clip(score.combine(voxels, terms), 0.0, 1.0))
+    return eqx.tree_at(lambda t: t.value, terms, own)
+
+
+def deficits(
+    voxels: MapState,
+    camera_position: Float[Array, " 3"],
+    focal: Float[Array, ""],
+    score: Score,
+    kappa_is_one: Bool[Array, " n"] | None = None,
+) -> Float[Array, " n"]:
+    """Computes 1 - R of every voxel, times its importance; arguments as in `score_voxels`."""
+    deficit = 1.0 - score_voxels(voxels, camera_position, focal, score, kappa_is_one).value
+    return deficit if score.importance is None else score.importance(voxels) * deficit
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2,))

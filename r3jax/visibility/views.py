@@ -19,6 +19,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from r3jax.errors import InputError
@@ -26,7 +27,7 @@ from r3jax.geometry.cameras import Camera
 from r3jax.kernels import calls
 
 
-def as_float32(value: float | Array) -> Float[Array, ""]:
+def as_float32(value: ArrayLike) -> Float[Array, "..."]:
     """Converts a setting, so that Python numbers and arrays compile to the same program."""
     return jnp.asarray(value, dtype=jnp.float32)
 

@@ -163,7 +163,7 @@ def renderabilities():
 
     def exact(m: MapState, pose: jax.Array):
         view, position = pinhole_view(CAMERA, pose, CONFIG), pose[:3, 3]
-        return formulas.mean_in_pixels(m, view, position, CAMERA.focal, CONFIG.forms)
+        return formulas.mean_in_pixels(m, view, position, CAMERA.focal, CONFIG.score)
 
     mean = lambda m, pose: r3jax.renderability(m, CAMERA, pose, CONFIG)
     image = lambda m, pose: r3jax.renderability_image(m, CAMERA, pose, CONFIG)
@@ -191,7 +191,7 @@ def test_renderability_is_that_of_the_reference(seed):
 
 def test_other_structs_of_xla_are_served_by_plain_jax(monkeypatch):
     monkeypatch.setattr(platform, "misread", lambda: "XLA_FFI_Buffer.data lies at 32, not at 24")
-    platform._warn.cache_clear()
+    platform.warn_once.cache_clear()
     state, grid = world(0)
     with pytest.warns(RuntimeWarning, match=r"XLA_FFI_Buffer\.data lies at 32"):
         found = jax.jit(asked_of(backend, "pinhole"))(state, cells_of(grid), poses_of(0)[0])
@@ -221,7 +221,7 @@ def changes():
         return module(*known, kept, position, CAMERA.focal, CONFIG, bins)
 
     def by_formulas(before, after, kept, position, focal, config, bins):
-        return formulas.change_of_sums(before, after, kept, position, focal, config.forms, bins)
+        return formulas.change_of_sums(before, after, kept, position, focal, config.score, bins)
 
     exact = lambda known, kept, at: jax.lax.map(lambda x: ask(by_formulas, known, *x), (kept, at))
     chosen = functools.partial(ask, backend.change_of_sums)

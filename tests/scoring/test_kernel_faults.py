@@ -75,7 +75,7 @@ def expected(kind: str):
     def look(view, position):
         at = position, CAMERA.focal, CONFIG
         sums = formulas.sums_in_view(state, cells, view, *at, NUM_BINS[kind])
-        return *sums, formulas.mean_in_pixels(state, view, *at[:2], CONFIG.forms)
+        return *sums, formulas.mean_in_pixels(state, view, *at[:2], CONFIG.score)
 
     answers = [look(v, p[:3, 3]) for v, p in zip(views_of(kind)[0], poses_of(2), strict=False)]
     return [np.stack([np.array(x) for x in part]) for part in zip(*answers, strict=True)]
@@ -168,7 +168,7 @@ def changes_agree(modules: Modules) -> None:
         results,
     )  # fmt: skip
     one = lambda bits, position: formulas.change_of_sums(
-        before, after, bits, position, CAMERA.focal, CONFIG.forms, bins
+        before, after, bits, position, CAMERA.focal, CONFIG.score, bins
     )
     change, explored = jax.jit(jax.vmap(one))(seen, positions)
     np.testing.assert_allclose(results[0], change, atol=1e-4)

@@ -7,9 +7,10 @@ import pytest
 
 import r3jax
 from r3jax.geometry.sphere import fibonacci_lattice
+from r3jax.kernels.calls import Forms
 from r3jax.mapping.state import MapState
 from r3jax.scoring import terms
-from r3jax.scoring.config import PAPER, Forms
+from r3jax.scoring.config import PAPER, Score
 
 NUM = 64
 SIZE = 0.05
@@ -40,7 +41,7 @@ def make_voxels():
     )
 
 
-def expected_terms(voxels, forms: Forms = PAPER) -> dict[str, np.ndarray]:
+def expected_terms(voxels, forms: Forms = PAPER.forms) -> dict[str, np.ndarray]:
     """The table of the design, voxel by voxel in float64."""
     words = np.asarray(voxels.visited)
     count, m2 = (np.asarray(x, np.float64) for x in (voxels.count, voxels.m2))
@@ -74,7 +75,7 @@ def expected_terms(voxels, forms: Forms = PAPER) -> dict[str, np.ndarray]:
 def law_formulas(kappa: str = "box", delta: str = "trace") -> None:
     voxels, forms = make_voxels(), Forms(kappa, delta)
     position = jnp.asarray(POSITION, jnp.float32)
-    found = terms.score_voxels(voxels, position, jnp.float32(FOCAL), forms)
+    found = terms.score_voxels(voxels, position, jnp.float32(FOCAL), Score(forms))
     for name, expected in expected_terms(voxels, forms).items():
         np.testing.assert_allclose(getattr(found, name), expected, atol=2e-5, err_msg=name)
 

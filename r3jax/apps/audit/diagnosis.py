@@ -282,7 +282,7 @@ def _answers(
         def score(
             rows: Int[Array, " K"], valid: Bool[Array, " K"], found: tuple[Array, Array]
         ) -> tuple[Array, Array]:
-            terms = score_voxels(voxels.take(rows, valid), position, focal, config.forms)
+            terms = score_voxels(voxels.take(rows, valid), position, focal, config.score)
             target = jnp.where(valid, rows, num)
             value, factors = found
             three = jnp.stack([terms.bias, terms.noise, terms.resolution])

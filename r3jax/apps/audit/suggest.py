@@ -140,7 +140,7 @@ def _gains(
 
             def of_standpoint(index: Int[Array, ""]) -> Float[Array, ""]:
                 position = demand.position[index]
-                value = score_voxels(part, position, camera.focal, config.forms).value
+                value = score_voxels(part, position, camera.focal, config.score).value
                 seen = valid & demand.visible[index, rows]
                 change = jnp.where(seen, value - answers.value[index, rows], 0.0)
                 return jnp.sum(change * weight[rows])

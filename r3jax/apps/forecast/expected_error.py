@@ -180,7 +180,7 @@ def error_terms(
     far = eqx.tree_at(lambda c: c.max_range, config, REACH * config.max_range)
     row = rows_in_pixels(state, pinhole_view(camera, T_world_camera, far), far)
     shown = voxels_of_rows(state, row)
-    value = score_voxels(shown, T_world_camera[:3, 3], camera.focal, config.forms).value
+    value = score_voxels(shown, T_world_camera[:3, 3], camera.focal, config.score).value
     contrast = _difficulty_in_pixels(state, row.reshape(-1), difficulty)
     hit = shown.present
     deficit = jnp.where(hit, 1.0 - value, 0.0)

@@ -128,7 +128,7 @@ def _add_sightings(
     def add(
         index: Int[Array, " K"], valid: Bool[Array, " K"], totals: Float[Array, "5 N"]
     ) -> Float[Array, "5 N"]:
-        part = score_voxels(voxels.take(index, valid), position, camera.focal, config.forms)
+        part = score_voxels(voxels.take(index, valid), position, camera.focal, config.score)
         rows = [part.value, part.bias, part.noise, part.resolution, jnp.ones_like(part.value)]
         target = jnp.where(valid, index, num)  # out of range on purpose: dropped
         return totals.at[:, target].add(jnp.stack(rows), mode="drop")

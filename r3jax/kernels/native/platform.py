@@ -36,7 +36,7 @@ view each pair takes some 60 bytes."""
 
 
 def call_of_many(
-    kernel: Callable[[Any, Any], Any],
+    kernel: Callable[[Any, Any], Any] | None,
     formula: Callable[[Any, Any], Any],
     shared: Any,
     item: Any,
@@ -49,6 +49,7 @@ def call_of_many(
 
     Args:
         kernel: of many items, whose arrays have a leading axis; gives arrays with the same axis.
+            None: the formula on every platform.
         formula: of one item.
         shared: such as the map.
         item: such as a view.
@@ -61,7 +62,8 @@ def call_of_many(
         return jax.lax.map(functools.partial(formula, shared), items, batch_size=size)
 
     items = jax.tree.map(lambda x: jnp.asarray(x)[None], item)
-    results = _over_items(by_platform(cpu=kernel, default=by_formula), shared, items)
+    score = by_formula if kernel is None else by_platform(cpu=kernel, default=by_formula)
+    results = _over_items(score, shared, items)
     return jax.tree.map(lambda x: x[0], results)
 
 
@@ -108,12 +110,12 @@ def can_call_kernels() -> bool:
     """Checks whether kernels run here; warns once if they do not, or only in turn."""
     problem = missing_for_kernels()
     if problem and jax.default_backend() == "cpu":
-        _warn(
+        warn_once(
             f"no machine code for CPUs, since {problem}; mapping, scoring, training and rendering "
             "(backend='xla') run in plain JAX, which is slower"
         )
     if not problem and _start()[0] == "workqueue":
-        _warn(
+        warn_once(
             "Numba finds neither OpenMP nor TBB: kernels run one after the other, which is slower "
             "where several are due at once (planning while moving). To run them side by side, "
             "install OpenMP (Debian: `apt install libgomp1`, macOS: `brew install libomp`) or "
@@ -156,7 +158,8 @@ def _start() -> tuple[str, str]:
 
 
 @functools.cache
-def _warn(text: str) -> None:
+def warn_once(text: str) -> None:
+    """Warns, the first time that it is called with a text."""
     warnings.warn(text, RuntimeWarning, stacklevel=1)
 
 

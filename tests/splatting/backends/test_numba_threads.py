@@ -141,6 +141,6 @@ def test_workers_follow_the_cores_of_the_process(monkeypatch):
 @pytest.mark.parametrize("name", ["auto", "numba"])
 def test_other_structs_of_xla_are_not_read_by_our_offsets(name, monkeypatch):
     monkeypatch.setattr(platform, "misread", lambda: "XLA_FFI_Buffer.data lies at 32, not at 24")
-    platform._warn.cache_clear()
+    platform.warn_once.cache_clear()
     with pytest.warns(RuntimeWarning, match=r"XLA_FFI_Buffer\.data.*32.*backend='xla'"):
         assert backend.find_backend(name) is xla_rasterize
