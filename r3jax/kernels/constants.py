@@ -105,8 +105,8 @@ SLACK_NOISE = 0.03
 HALF_DIAGONAL = 0.867
 """Half the diagonal of a voxel, in edges: its footprint in an image is within this."""
 
-MOST_HALF = 31
-"""Largest half footprint [px]; voxels with larger ones are too close for a conclusion."""
+MOST_SAMPLES = 63
+"""Pixels looked at along a side of a voxel's footprint; of wider ones every second, third, ..."""
 
 LEAST_FOOTPRINT = 1.5
 """Smallest size of a voxel in an image [px]; smaller ones are too far away for a conclusion."""

@@ -63,6 +63,81 @@ def test_a_person_who_has_left_is_gone_within_three_looks(frames_with_person):
     assert ghosts(forever) > 150
 
 
+@pytest.mark.parametrize("yaw", [30.0, -30.0])
+def test_a_person_at_the_border_of_the_image_is_gone_as_far_as_it_shows(yaw):
+    """Half of a footprint beyond the border is no reason to keep what the other half denies."""
+    there = frame_in_room(CAMERA, pose_at(EYE, yaw, -8.0), [PERSON])
+    later = [frame_in_room(CAMERA, pose_at(EYE, yaw, -8.0), seed=i) for i in range(3)]
+    state = mapped([there])
+    before, left = (ghost_pixels(one, there) for one in (state, mapped(later, state)))
+    half = int(np.ceil(float(CAMERA.fx) * 0.867 * 0.05 / 2.0)) + 1
+    at_border = lambda x: np.sum((x[:, 0] < half) | (x[:, 0] >= CAMERA.width - half))
+    assert at_border(before) > 20
+    # All but those at the floor's and the images' corners, of which a quarter is in view.
+    assert len(left) <= 0.05 * len(before)
+
+
+def ghost_pixels(state: MapState, frame: r3jax.Frame) -> np.ndarray:
+    """Columns and rows of the voxels in the middle of the room that lie in a frame, [n, 2]."""
+    xyz = centers(state)
+    inside = (xyz > ROOM[0] + 0.25) & (xyz < ROOM[1] - 0.25)
+    T = np.linalg.inv(np.asarray(frame.T_world_camera, np.float64))
+    x, y, z = T[:3, :3] @ xyz[inside.all(axis=1)].T + T[:3, 3:]
+    camera = frame.camera
+    pixels = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1)
+    return pixels[((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1) & (z > 0)]
+
+
+def test_a_person_behind_a_pole_is_gone_beside_it():
+    """What is nearer than a voxel hides a part of it, and says nothing about the rest."""
+    pole = np.array([[-0.6, -0.02, 0.0], [-0.56, 0.02, 2.6]])
+    person = np.array([[0.6, -0.25, 0.0], [0.9, 0.25, 1.7]])
+    there, later = looks(1, boxes=[pole, person]), looks(3, boxes=[pole])
+    state = mapped(there)
+    row = lambda s: ghost_pixels(s, there[0])
+    is_pole = lambda x: np.abs(x[:, 0] - 80.0) < 30.0
+    assert is_pole(row(state)).sum() > 50
+    only_pole = mapped(later, mapped(looks(1, boxes=[pole])))
+    assert len(row(mapped(later, state))) - len(row(only_pole)) <= 0.05 * len(row(state))
+
+
+@pytest.mark.parametrize("width", [320, 1280])
+def test_a_person_near_by_is_gone_in_images_of_any_size(width):
+    camera = r3jax.Camera.from_fov(width, 3 * width // 4, 70.0)
+    near = np.array([[-0.8, -0.25, 0.0], [-0.6, 0.25, 1.7]])  # 0.6 m before the camera
+    [there] = [frame_in_room(camera, pose_at(EYE, 0.0, 0.0), [near])]
+    state = mapped([there])
+    assert ghosts(state) > 50
+    later = [frame_in_room(camera, pose_at(EYE, 0.0, 0.0), seed=i) for i in range(3)]
+    assert ghosts(mapped(later, state)) <= 0.05 * ghosts(state)
+
+
+def test_pixels_on_depth_edges_that_hang_in_the_air_are_gone_after_three_clean_looks():
+    """A sensor mixes the depths before and behind an edge; from beside it frames see through."""
+    box = np.array([[0.4, -0.5, 0.0], [0.9, 0.5, 1.3]])
+    [frame] = looks(1, boxes=[box])
+    depth = np.array(frame.depth)
+    step = np.abs(np.diff(depth, axis=1)) > 0.3
+    mixed = 0.5 * (depth[:, 1:] + depth[:, :-1])
+    depth[:, 1:][step] = mixed[step]
+    flying = r3jax.Frame(frame.rgb, depth, frame.T_world_camera, CAMERA)
+    later = [
+        frame_in_room(CAMERA, pose_at((-1.4, y, 1.2), -8.0 * np.sign(y), -8.0), [box], seed=i)
+        for y in (-1.3, 1.3)
+        for i in range(3)
+    ]
+    state = r3jax.integrate(new_map(), flying, drop_edges=False)
+    # The same frames without the mixture: what they lack hangs in the air.
+    true = set(map(tuple, centers(mapped([frame, *later], new_map(remove_moved=False)))))
+    hanging = set(map(tuple, centers(state))) - true
+    xyz = np.array(sorted(hanging))
+    # Within two voxels of a surface, and the noise of the depth, they are not told from it.
+    hanging = set(map(tuple, xyz[~near_surfaces(xyz, [box], within=0.2)]))
+    left = hanging & set(map(tuple, centers(mapped(later, state))))
+    assert len(hanging) > 50
+    assert len(left) <= 0.1 * len(hanging)
+
+
 def test_a_person_in_a_mask_leaves_nothing():
     [seen], [empty] = looks(1, boxes=[PERSON]), looks(1)
     mask = np.asarray(seen.depth) < np.asarray(empty.depth) - 0.01

@@ -172,20 +172,24 @@ def _mark_all(visited, resolution, key, camera, frame, is_visible, bins, lattice
 
 
 @inlined_fused
-def _is_open(depth, pixel, z, focal, size, limit):
-    """Checks whether all pixels of a voxel's footprint measure something beyond a limit."""
+def _is_open(depth, pixel, z, focal, size, slack):
+    """Checks whether most of a voxel's footprint shows what is behind it, and nothing shows it."""
     height, width = depth.shape
     half = np.int64(math.ceil(focal * _HALF_DIAGONAL * size / z)) + 1
-    row, column = pixel // width, pixel % width
-    if half > constants.MOST_HALF or row < half or column < half:
-        return False
-    if row + half >= height or column + half >= width:
-        return False
-    for i in range(row - half, row + half + 1):
-        for j in range(column - half, column + half + 1):
-            if not depth[i, j] > limit:
+    step = 1 + 2 * half // constants.MOST_SAMPLES
+    row, column, near, limit = pixel // width, pixel % width, z - slack, z + slack
+    total, beyond = 0, 0
+    for i in range(row - half, row + half + 1, step):
+        for j in range(column - half, column + half + 1, step):
+            total += 1
+            if i < 0 or j < 0 or i >= height or j >= width:
+                continue
+            measured = depth[i, j]
+            if measured > limit:
+                beyond += 1
+            elif not (_ZERO < measured < near):
                 return False
-    return True
+    return 2 * beyond > total
 
 
 @kernel
@@ -232,7 +236,7 @@ def _miss_all(counts, m2, mean, misses, key, resolution, size, frame, workers):
                 sharpness = frame.focal / z
                 if sharpness < _SHARE * resolution[row] or sharpness * size < _LEAST:
                     continue
-                if not _is_open(depth, pixel, z, focal, size, z + slack):
+                if not _is_open(depth, pixel, z, focal, size, slack):
                     continue
                 misses[row] += 1
                 if misses[row] >= (
