@@ -181,14 +181,43 @@ def test_unknown_floor_is_trusted_round_the_first_place_only():
     assert not np.isfinite(room.cost[12]).any()
 
 
-def test_a_thin_thing_that_the_map_does_not_hold_is_an_obstacle():
+@pytest.mark.parametrize("height", [0.2, HEIGHT])
+def test_a_thin_thing_that_the_map_does_not_hold_is_an_obstacle(height):
+    """Also of a body that is no taller than the cells that hold the floor."""
     log_odds = np.array(grid_of(all_free()).log_odds)
+    log_odds[:, :, :2] = 3.0  # the floor
     log_odds[16, :, 2] = 3.0
     grid = OccupancyGrid(
         jnp.asarray(log_odds), jnp.full(3, -CELL, jnp.float32), jnp.asarray(CELL, jnp.float32)
     )
-    room = room_for(Body(0.2), grid, floor_voxels(), VOXEL, pose_at(2.0, 2.0))
+    room = room_for(Body(0.2), grid, floor_voxels(), VOXEL, pose_at(2.0, 2.0, height))
+    assert np.isfinite(room.cost[14]).any()
     assert not np.isfinite(room.cost[18:]).any()
+
+
+@pytest.mark.parametrize("top", [0.5, 0.75, 1.0])
+def test_the_top_of_a_table_is_not_the_floor(top):
+    """A level camera at 1.5 m shows it long before it shows the floor."""
+    voxels = floor_voxels(lambda x, y: 0.0 * x + top + VOXEL)
+    voxels = voxels[np.all((voxels[:, :2] > 1.8) & (voxels[:, :2] < 3.0), axis=1)]
+    y = np.arange(0.025, SIZE, VOXEL)
+    wall = [pole(SIZE - 0.025, v, 0.3, 2.0) for v in y]
+    room = room_for(
+        Body(0.2), grid_of(all_free()), np.concatenate([voxels, *wall]), VOXEL,
+        pose_at(0.5, 0.5, 1.5),
+    )  # fmt: skip
+    assert room.floor[3, 3] == pytest.approx(0.0, abs=1e-6)
+    assert not room.fits(np.array([[2.4, 2.4]])).any()
+
+
+def test_the_landing_of_a_stair_is_the_floor():
+    """Where the floor below can be seen, too."""
+    lower = floor_voxels()
+    landing = lower[lower[:, 0] < 3.0] + [0.0, 0.0, 1.0]
+    below = lower[lower[:, 0] > 3.4]
+    voxels = np.concatenate([landing, below])
+    room = room_for(Body(0.2), grid_of(all_free()), voxels, VOXEL, pose_at(1.0, 2.0, 1.0 + HEIGHT))
+    assert room.floor[6, 11] == pytest.approx(1.0, abs=VOXEL)
 
 
 def test_a_polygon_needs_the_room_to_turn():

@@ -40,6 +40,13 @@ _FLOOR_WITHIN = 3.0
 _FLOOR_SHARE = 0.25
 """The floor is the lowest level with this share of the voxels of the fullest one."""
 
+_NOTHING_BELOW = 5.0
+"""Up to this distance from the robot hardly anything lies below the floor [m]."""
+
+_MAX_BELOW = 0.5
+"""A level with this number of voxels below it, as a share of its own, is the top of a table or a
+bed, and the floor has not been seen."""
+
 _MAX_BLIND = 2.5
 """A camera that first shows the floor farther off than this [m] does not show what stands before
 it, and has no blind spot that may be trusted."""
@@ -283,7 +290,14 @@ class _Known:
         The seat of a chair does not explain what was measured below it: that is a leg.
         """
         unexplained = self.occupied & ~self.cells_with(self.obstacles)
-        return np.any(self.within & unexplained & ~self.holds_floor, axis=2)
+        thin = np.any(self.within & unexplained & ~self.holds_floor, axis=2)
+        # In the floor's own cells a leg is not told from the floor. Of a body that is no taller
+        # than they are, the cell above shows it.
+        above = self.occupied & ~self.cells_with(self.voxels[self.above > self.low])
+        first = self.holds_floor.shape[2] - np.argmax(self.holds_floor[..., ::-1], axis=2)
+        first = np.minimum(first, above.shape[2] - 1)[..., None]
+        is_low = ~np.any(self.within & ~self.holds_floor, axis=2)
+        return thin | (is_low & np.take_along_axis(above, first, axis=2)[..., 0])
 
     @functools.cached_property
     def holds_floor(self) -> np.ndarray:
@@ -484,6 +498,7 @@ def _floor_at(
     if body.floor is not None:
         return body.floor
     gap = np.linalg.norm(voxels[:, :2] - position[:2], axis=1)
+    around = voxels[gap < _NOTHING_BELOW, 2]
     z = voxels[(gap < _FLOOR_WITHIN) & (voxels[:, 2] < position[2] + voxel_size), 2]
     if len(z) >= 20:
         level = np.rint((z - z.min()) / voxel_size).astype(np.int64)
@@ -491,8 +506,9 @@ def _floor_at(
         count = np.bincount(level, minlength=num)
         # A camera that never shows the floor shows walls, in which all levels are alike.
         is_flat = (count >= _FLOOR_SHARE * count.max()) & (count >= 3.0 * np.median(count))
-        if is_flat.any():
-            lowest = int(np.argmax(is_flat))
+        lowest = int(np.argmax(is_flat))
+        below = np.count_nonzero(around < z.min() + (lowest - 1.5) * voxel_size)
+        if is_flat.any() and below < _MAX_BELOW * count[lowest]:
             # A floor on the border of two levels fills both of them.
             is_floor = (level == lowest) | (
                 (level == lowest + 1) & (count[level] >= 0.5 * count[lowest])
