@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from r3jax.errors import InputError
+from r3jax.formats.cut import Cut
 
 Surfaces = Literal["auto", "depth", "sweep", "model", "points"]
 """Sources of depth; see `captures.surfaces`."""
@@ -51,6 +52,14 @@ class SurveySettings:
     """Trained splat (.ply of gsplat, nerfstudio, INRIA's 3DGS, Brush or Postshot) in the capture's
     coordinates; depth is rendered from it."""
 
+    hide_below: float = 25.0
+    """Of 360 photos, this many degrees around the direction below the camera are masked: the hand,
+    person or tripod that holds it. 0 masks nothing."""
+
+    overlap_360: float = 0.0
+    """Angle that neighboring views of a 360 photo share [deg]; it is cut into six pinhole views of
+    90 degrees and this angle."""
+
     trust_depth: bool = False
     """Use the depth images even if they contradict the poses or each other."""
 
@@ -65,6 +74,12 @@ class SurveySettings:
         if self.model is not None and self.surfaces not in ("auto", "model"):
             raise InputError(f"--model and --surfaces {self.surfaces} exclude each other")
         at_least(self, {"max_frames": 2})
+        _ = self.cut
+
+    @property
+    def cut(self) -> Cut:
+        """How photos of 360 degrees are cut into views."""
+        return Cut(self.overlap_360, self.hide_below)
 
 
 def at_least(settings: object, least: dict[str, int]) -> None:

@@ -26,20 +26,12 @@ from r3jax.captures.alignment import Alignment, evenly_spaced
 from r3jax.errors import InputError
 from r3jax.formats.colmap.reader import find_model
 from r3jax.formats.errors import FormatError, naming
-from r3jax.formats.lenses import Lens, pinhole_lens
+from r3jax.formats.lenses import Lens, distorted, pinhole_lens
 from r3jax.formats.points import read_points
 from r3jax.formats.posed_images import PosedImages, Reconstruction
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.runs.reader import Run
-from r3jax.validation.errors import ForeignFileError
-
-_RADIAL = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-_FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE",
-            "FISHEYE")  # fmt: skip
-
-
-_DIVISION = ("SIMPLE_DIVISION", "DIVISION")
 
 
 class SamplingTable(NamedTuple):
@@ -110,70 +102,6 @@ def sampling_table(lens: Lens, stride: int) -> SamplingTable:
     is_there = (column >= 0) & (column < lens.width) & (row >= 0) & (row < lens.height)
     column, row = np.where(is_there, column, 0), np.where(is_there, row, 0)
     return SamplingTable(row.astype(np.int64), column.astype(np.int64), is_there)
-
-
-def distorted(lens: Lens, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distorts the ray (x, y, 1): the normalized coordinates at which the lens shows it.
-
-    The models are COLMAP's: a polynomial in the squared radius and a tangential part (Brown), or
-    in the angle to the axis (fisheye).
-
-    Args:
-        lens: the lens.
-        x: slopes of the rays to the right.
-        y: slopes of the rays downwards.
-
-    Raises:
-        ForeignFileError: another model.
-    """
-    k = {"k1": lens.named.get("k", 0.0), **lens.named}
-    value = lambda name: k.get(name, 0.0)
-    squared = x * x + y * y
-    if lens.model in _FISHEYE:
-        radius = np.sqrt(squared)
-        angle = np.arctan(radius)
-        t = angle * angle
-        bent = 1.0 + t * (value("k1") + t * (value("k2") + t * (value("k3") + t * value("k4"))))
-        factor = np.where(radius > 1e-9, angle * bent / np.maximum(radius, 1e-9), 1.0)
-        return x * factor, y * factor
-    if lens.model == "THIN_PRISM_FISHEYE":
-        radius = np.sqrt(squared)
-        scale = np.where(radius > 1e-9, np.arctan(radius) / np.maximum(radius, 1e-9), 1.0)
-        x, y = x * scale, y * scale
-        r2 = x * x + y * y
-        radial = r2 * (value("k1") + r2 * (value("k2") + r2 * (value("k3") + r2 * value("k4"))))
-        p1, p2 = value("p1"), value("p2")
-        return (
-            x + x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x) + value("sx1") * r2,
-            y + y * radial + 2.0 * p2 * x * y + p1 * (r2 + 2.0 * y * y) + value("sy1") * r2,
-        )
-    if lens.model == "FOV":
-        radius, omega = np.sqrt(squared), max(abs(value("omega")), 1e-6)
-        bent = np.arctan(2.0 * radius * np.tan(0.5 * omega)) / omega
-        factor = np.where(radius > 1e-9, bent / np.maximum(radius, 1e-9), 1.0)
-        return x * factor, y * factor
-    if lens.model == "EUCM":
-        alpha = value("alpha")
-        depth = alpha * np.sqrt(value("beta") * squared + 1.0) + 1.0 - alpha
-        return x / depth, y / depth
-    if lens.model in _DIVISION:
-        # r = bent / (1 + k bent^2), solved for what the lens shows.
-        under = np.maximum(1.0 - 4.0 * value("k1") * squared, 0.0)
-        factor = 2.0 / (1.0 + np.sqrt(under))
-        return x * factor, y * factor
-    if lens.model not in _RADIAL:
-        raise ForeignFileError(
-            f"images of a {lens.model} lens cannot be undistorted here: undistort the capture "
-            "first, for example by COLMAP's image_undistorter"
-        )
-    upper = 1.0 + squared * (value("k1") + squared * (value("k2") + squared * value("k3")))
-    lower = 1.0 + squared * (value("k4") + squared * (value("k5") + squared * value("k6")))
-    factor = upper / np.where(np.abs(lower) > 1e-9, lower, 1.0)
-    p1, p2 = value("p1"), value("p2")
-    return (
-        x * factor + 2.0 * p1 * x * y + p2 * (squared + 2.0 * x * x),
-        y * factor + 2.0 * p2 * x * y + p1 * (squared + 2.0 * y * y),
-    )
 
 
 class Projected(NamedTuple):
@@ -318,6 +246,9 @@ class Source:
     reconstruction: Reconstruction | None = None
     """Quality measures of the structure from motion; None if the format has none."""
 
+    photo_of: np.ndarray | None = None
+    """Number of the photo that each image was cut from, [n]; None: each is a photo of its own."""
+
     def __len__(self) -> int:
         """Returns the number of images."""
         return len(self.poses)
@@ -334,6 +265,23 @@ class Source:
         Otherwise a surface may be in view of many images and have no point: it is not known.
         """
         return self.kind == "depth"
+
+    def some(self, most: int, among: np.ndarray | None = None) -> np.ndarray:
+        """Picks at most `most` images, evenly spread over the capture, ascending.
+
+        Of a photo that was cut into views all are picked, or none: evenly spaced ones might all
+        look in the same direction.
+
+        Args:
+            most: how many.
+            among: indices to choose from; None: all.
+        """
+        among = np.arange(len(self)) if among is None else among
+        if self.photo_of is None or len(among) <= most:
+            return among[evenly_spaced(len(among), most)]
+        photos, counts = np.unique(self.photo_of[among], return_counts=True)
+        chosen = photos[evenly_spaced(len(photos), max(1, most // int(counts.max())))]
+        return among[np.isin(self.photo_of[among], chosen)]
 
     def camera(self, index: int) -> Camera:
         """Returns the pinhole of a thinned image."""
@@ -417,12 +365,18 @@ def source_of(capture: Run | PosedImages, name: str) -> Source:
 
 
 def _of_images(images: PosedImages, name: str) -> Source:
+    if len(images) > 2 and np.ptp(images.poses, axis=0).max() == 0.0:
+        raise FormatError(
+            images.path,
+            f"the poses of all {len(images)} images are equal: they were not found yet, so run the "
+            "structure from motion or the tracking first",
+        )
     stride = _stride(images.lenses)
     with naming(images.path):
         for lens in set(images.lenses):
             sampling_table(lens, stride)  # refuses a lens that it does not know
     labels = tuple(path.name for path in images.image_paths)
-    has_images = images.pixels is not None or any(path.is_file() for path in images.image_paths)
+    has_images = images.has_images
     remark = images.remark
     if not has_images:
         none = (
@@ -440,7 +394,7 @@ def _of_images(images: PosedImages, name: str) -> Source:
             name, images.poses, images.lenses, labels, "depth" if is_camera else "stereo",
             is_camera, images.up, stride,
             lambda index: _read_dense(images, index, stride, has_images), has_images, remark,
-            photograph, images.reconstruction,
+            photograph, images.reconstruction, images.photo_of,
         )  # fmt: skip
     if images.points is not None and len(images.points.seen_point):
         kind: Kind = "tracks"
@@ -457,9 +411,10 @@ def _of_images(images: PosedImages, name: str) -> Source:
     if count < _FEWEST_POINTS:
         raise FormatError(
             images.points_path or images.path,
-            f"there are no depth images, and only {count} points: an audit needs one of them, "
-            f"and at least {_FEWEST_POINTS} points",
+            f"there are no depth images, and only {count} points, fewer than {_FEWEST_POINTS}: the "
+            "reconstruction failed, so take more pictures that overlap and reconstruct again",
         )
+    _check_points(images, xyz, seen if ends is not None else None)
 
     def read(index: int) -> Picture:
         part = seen if ends is None else seen[ends[index] : ends[index + 1]]
@@ -474,8 +429,57 @@ def _of_images(images: PosedImages, name: str) -> Source:
 
     return Source(
         name, images.poses, images.lenses, labels, kind, False, images.up, stride, read, has_images,
-        remark, photograph, images.reconstruction,
+        remark, photograph, images.reconstruction, images.photo_of,
     )  # fmt: skip
+
+
+_MOST_CHECKED = 100_000
+"""Pairs of a point and an image that are checked."""
+
+_BEHIND = 0.5
+"""Maximum share of points behind the cameras that see them, or of cameras that see no point."""
+
+
+def _check_points(images: PosedImages, xyz: np.ndarray, seen: np.ndarray | None) -> None:
+    """Refuses points that contradict the cameras: behind them, or of another scene or scale.
+
+    Args:
+        images: the capture.
+        xyz: its points, [m, 3].
+        seen: None if nothing says which image sees which point; else that of `images.points` is
+            checked.
+    """
+    rng = np.random.default_rng(0)
+    centers = images.poses[:, :3, 3]
+    if seen is not None and images.points is not None:
+        some = rng.permutation(len(images.points.seen_point))[:_MOST_CHECKED]
+        point, image = images.points.seen_point[some], images.points.seen_image[some]
+        axes = images.poses[image, :3, 2]
+        behind = float((np.einsum("ij,ij->i", xyz[point] - centers[image], axes) <= 0.0).mean())
+        if behind > _BEHIND:
+            raise FormatError(
+                images.path,
+                f"{100 * behind:.0f} % of the points lie behind the cameras that see them: the "
+                "poses are of another convention (COLMAP's take the world to the camera, with z "
+                "forward), or points and poses are of different reconstructions",
+            )
+        return
+    some = xyz[rng.permutation(len(xyz))[: _MOST_CHECKED // len(images) + 1]]
+    blind = [
+        not projected(lens.camera, pose, some).is_in.any()
+        for lens, pose in zip(images.lenses, images.poses, strict=True)
+    ]
+    if np.mean(blind) > _BEHIND:
+        middle = np.median(some, axis=0)
+        apart = float(np.linalg.norm(middle - np.median(centers, axis=0)))
+        size = float(np.linalg.norm(np.ptp(some, axis=0)))
+        spread = float(np.linalg.norm(np.ptp(centers, axis=0)))
+        raise FormatError(
+            images.points_path or images.path,
+            f"{sum(blind)} of {len(blind)} cameras have none of its points in view: the points "
+            f"span {size:.3g} and the cameras {spread:.3g}, {apart:.3g} apart, so they are of "
+            "another scene, scale or coordinate system; give the points of these poses",
+        )
 
 
 def _stride(lenses: tuple[Lens, ...] | list[Lens]) -> int:
@@ -501,16 +505,18 @@ def _thinned_colors(images: PosedImages, index: int, stride: int) -> tuple[np.nd
     return table.take(rgb), table.is_there if mask is None else table.take(mask)
 
 
-_MEASURED = 5
+_MEASURED = 12
 """Images whose masks are measured."""
 
 
 def _hidden_share(images: PosedImages) -> float:
     """Measures the share of the pictures that masks and alpha channels cut out, of some."""
-    if images.pixels is not None:
+    if images.pixels is not None and images.pixels.mask is None:
         return 0.0
     shares: list[float] = []
-    for index in evenly_spaced(len(images), _MEASURED).tolist():
+    # At random: the views of a photo that was cut follow each other.
+    some = np.random.default_rng(0).permutation(len(images))[:_MEASURED]
+    for index in np.sort(some).tolist():
         with suppress(FormatError):  # what cannot be read is named when all are
             mask = images.masked_rgb(index)[1]
             shares.append(0.0 if mask is None else float(1.0 - mask.mean()))
@@ -520,7 +526,9 @@ def _hidden_share(images: PosedImages) -> float:
 def _photograph(images: PosedImages, index: int, stride: int) -> Photograph:
     table = sampling_table(images.lenses[index], stride)
     rgb, mask = images.masked_rgb(index)
-    gray = (rgb @ _BRIGHTNESS).astype(np.float32)
+    gray = rgb[..., 0] * _BRIGHTNESS[0]  # channel by channel: photos may have 100 megapixels
+    for channel in (1, 2):
+        gray += rgb[..., channel] * _BRIGHTNESS[channel]
     # A pixel of the thinned image is at the middle of its block: an odd window has one, too.
     smooth = ndimage.uniform_filter(gray, stride | 1) if stride > 1 else gray
     colors, brightness = table.take(rgb), table.take(smooth)

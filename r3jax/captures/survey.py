@@ -202,7 +202,7 @@ def survey_of(source: Source, settings: SurveySettings) -> Survey:
         ValueError: a setting is invalid, or depth images contradict the poses.
         FormatError: no image has any depth, or a file is missing or broken.
     """
-    chosen = evenly_spaced(len(source), settings.max_frames)
+    chosen = source.some(settings.max_frames)
     images = _depth_images(source, chosen)
     depths, points = _measured(source, images)
     if len(left_out := _strays(source, chosen, float(np.median(depths)))):
@@ -249,7 +249,7 @@ def survey_of(source: Source, settings: SurveySettings) -> Survey:
 
 
 def _depth_images(source: Source, chosen: np.ndarray) -> list[DepthImage]:
-    looked = chosen[evenly_spaced(len(chosen), _SURVEYED)]
+    looked = source.some(_SURVEYED, chosen)
     images: list[DepthImage] = []
     for i in looked.tolist():
         with suppress(FormatError):  # what cannot be read is named once all have been tried
@@ -265,7 +265,11 @@ def _measured(source: Source, images: list[DepthImage]) -> tuple[np.ndarray, np.
     local = [look.points(_VALUES, rng) for look in images]
     depths = np.concatenate([points[:, 2] for points in local])
     if len(depths) < 3:
-        raise FormatError(Path(source.name), "no picture shows a surface of known depth")
+        raise FormatError(
+            Path(source.name),
+            "no picture shows a surface of known depth: depth is empty, or the points lie outside "
+            "of all images, so intrinsics (principal point, size) or poses are of other images",
+        )
     world = [
         points @ look.pose[:3, :3].T + look.pose[:3, 3]
         for points, look in zip(local, images, strict=True)

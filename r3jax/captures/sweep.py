@@ -193,6 +193,10 @@ def smooth_scores(
     return down + jnp.swapaxes(across, 0, 1)
 
 
+_SAME_PLACE = 1e-6
+"""Distance between cameras at the same place, as a share of the extent of all."""
+
+
 def choose_sources(
     photos: Sequence[Photo], points_of: Callable[[int], np.ndarray], most: int = SOURCES
 ) -> list[np.ndarray]:
@@ -208,14 +212,17 @@ def choose_sources(
     """
     chosen: list[np.ndarray] = []
     centers = np.stack([photo.pose[:3, 3] for photo in photos])
+    # Images from the same place (views of one 360 photo, or of a rig) have no parallax.
+    closest = _SAME_PLACE * float(np.linalg.norm(np.ptp(centers, axis=0)))
     for own in range(len(photos)):
         points = points_of(own)
+        apart = np.linalg.norm(centers - centers[own], axis=1)
         weight = np.zeros(len(photos))
         if len(points):
             rays = points - centers[own]
             rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-9)
             for other, photo in enumerate(photos):
-                if other != own:
+                if apart[other] > closest:
                     weight[other] = _weight(photo, points, rays)
         order = np.argsort(-weight, kind="stable")[:most]
         chosen.append(order[weight[order] > 0.0])

@@ -6,11 +6,14 @@ The content of an unsupported folder is guessed, and a command to convert it is 
 import os
 import re
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from r3jax.formats.colmap.reader import find_model, read_colmap
+from r3jax.formats.cut import Cut
+from r3jax.formats.cut_views import cut_wide
 from r3jax.formats.errors import FormatError, check_capture
 from r3jax.formats.nerfstudio import find_transforms, read_transforms
 from r3jax.formats.phones.archives import SUFFIXES, open_zip
@@ -18,7 +21,7 @@ from r3jax.formats.phones.arkit_scenes import is_arkit_scenes, read_arkit_scenes
 from r3jax.formats.phones.polycam import is_polycam, read_polycam
 from r3jax.formats.phones.record3d import is_record3d, read_record3d
 from r3jax.formats.phones.stray_scanner import is_stray_scanner, read_stray_scanner
-from r3jax.formats.posed_images import PosedImages
+from r3jax.formats.posed_images import IMAGE_FORMATS, PosedImages
 from r3jax.formats.recordings import is_recording, read_recording
 from r3jax.formats.ros.bag_reader import read_bag
 from r3jax.formats.ros.bags import Topics, is_bag
@@ -36,6 +39,7 @@ from r3jax.frame import Frame
 from r3jax.runs.reader import Run, read_run
 from r3jax.validation.database import check_database
 from r3jax.validation.errors import ForeignFileError
+from r3jax.validation.images import first_size
 
 _FORMATS: tuple[tuple[Callable[[Path], bool], Callable[[Path], PosedImages]], ...] = (
     (is_replica_slam, read_replica_slam),
@@ -115,13 +119,21 @@ class Capture:
         return Path("runs") / self.name / "models"
 
 
-def open_capture(path: Path, up: Literal["y", "z"] = "y", topics: Topics | None = None) -> Capture:
+def open_capture(
+    path: Path,
+    up: Literal["y", "z"] = "y",
+    topics: Topics | None = None,
+    cut: Cut | None = None,
+) -> Capture:
     """Opens a run, a recording, or posed images of any format.
+
+    Photos of 360 degrees and fisheyes of nearly 180 are cut into pinhole views.
 
     Args:
         path: the folder, an app's archive, or nerfstudio's file.
         up: axis of a recording's world that points up; the others stay as they are.
         topics: names of a ROS bag's topics and frames; None: detected.
+        cut: how 360 photos are cut; None: by default.
 
     Raises:
         FormatError: an unknown or a broken format.
@@ -130,16 +142,16 @@ def open_capture(path: Path, up: Literal["y", "z"] = "y", topics: Topics | None 
     if topics is not None:
         if not is_bag(path):
             raise FormatError(path, "--topics was given, but this is not a ROS bag")
-        return Capture(path, read_bag(path, topics))
+        return Capture(path, cut_wide(read_bag(path, topics), cut))
     if path.is_file() and path.suffix == ".json":
-        return Capture(path, read_transforms(path).fitted())
+        return Capture(path, cut_wide(read_transforms(path).fitted(), cut))
     if (path / "run.json").exists():
         return Capture(path, read_run(path))
     if is_recording(path):
         return Capture(path, read_recording(path, up))
     for fits, read in _FORMATS:
         if fits(path):
-            return Capture(path, read(path).fitted())
+            return Capture(path, cut_wide(read(path).fitted(), cut))
     check_capture(path)
     guess = _below(path) or nearest_guess(path)
     raise FormatError(path, guess or f"this is neither {_KNOWN}")
@@ -201,6 +213,8 @@ def _names(path: Path) -> list[str]:
     """Lists names in a folder and in the folders below it, joined by a slash."""
     found: list[str] = []
     for entry in sorted(os.listdir(path))[:_MOST]:
+        if entry.startswith("."):
+            continue
         found.append(entry)
         if (path / entry).is_dir():
             found += [f"{entry}/{name}" for name in sorted(os.listdir(path / entry))[:_MOST]]
@@ -331,10 +345,24 @@ def _images(path: Path, names: list[str]) -> str | None:
     found = [name for name in names if name.lower().endswith(_IMAGES)]
     colors = [name for name in found if not name.lower().startswith(_NO_COLORS)]
     folder = (path / (colors or found)[0]).parent
+    if _are_panoramas(path, colors):
+        return (
+            "these look like 360 photos without poses: COLMAP finds them with --ImageReader."
+            "camera_model EQUIRECTANGULAR (version 4 or later), or its panorama_sfm.py; then audit "
+            "the folder of the photos and of sparse/0"
+        )
     return (
         f"these look like images without poses: ns-process-data images --data {folder} "
         "--output-dir OUT finds them by COLMAP, then audit OUT"
     )
+
+
+def _are_panoramas(path: Path, names: list[str]) -> bool:
+    """Checks whether the first image that can be opened is twice as wide as high."""
+    with suppress(ForeignFileError, OSError):
+        width, height = first_size((path / name for name in names), IMAGE_FORMATS)
+        return width == 2 * height
+    return False
 
 
 def _model(path: Path, names: list[str]) -> str | None:

@@ -29,8 +29,8 @@ from r3jax.exploration.taken_views import StepRow
 from r3jax.files import write_atomic
 from r3jax.formats.depth import DepthUnit
 from r3jax.formats.errors import naming
-from r3jax.formats.lenses import Lens
-from r3jax.formats.posed_images import COPIES, IMAGE_FORMATS, PosedImages
+from r3jax.formats.lenses import DUAL_FISHEYE, PANORAMA, Lens
+from r3jax.formats.posed_images import COPIES, IMAGE_FORMATS, PosedImages, find_mask
 from r3jax.formats.poses import mend_pose
 from r3jax.runs.reader import Run
 from r3jax.validation.errors import ForeignFileError
@@ -64,6 +64,8 @@ _SIMPLE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FU
 _MODELS = {
     **dict.fromkeys((*_SIMPLE, "PERSPECTIVE"), "OPENCV"),
     **dict.fromkeys(("OPENCV_FISHEYE", "FISHEYE"), "OPENCV_FISHEYE"),
+    PANORAMA: PANORAMA,
+    DUAL_FISHEYE: DUAL_FISHEYE,
 }
 """Names of camera models, and which polynomial their k1, k2, ... belong to."""
 
@@ -109,6 +111,8 @@ def read_transforms(path: Path | str) -> PosedImages:
         moved, unit = _applied(content), _depth_unit(content)
         depths = [_depth(path.parent, i, frame) for i, frame in enumerate(frames)]
         masks = [_mask(path.parent, i, frame) for i, frame in enumerate(frames)]
+        unmasked = _missing_masks(masks)
+        masks = [None if mask is None or not os.path.isfile(mask) else mask for mask in masks]
         scale = _applied_scale(content)
     lenses = [
         _lens(path, f"frames[{i}]", {**content, **frame}, [image, *images])
@@ -133,6 +137,8 @@ def read_transforms(path: Path | str) -> PosedImages:
                 f"The positions in transforms.json are scaled by {scale:g} (applied_scale), and "
                 "so are all lengths here: without depth images that is not undone."
             )
+    if unmasked is not None:
+        remark = unmasked if remark is None else f"{unmasked} {remark}"
     return PosedImages(
         path=path,
         image_paths=tuple(images),
@@ -148,11 +154,21 @@ def read_transforms(path: Path | str) -> PosedImages:
 
 
 def _mask(folder: Path, index: int, frame: dict[str, Any]) -> Path | None:
-    """Returns the mask of a frame, if one is named and there."""
+    """Returns the mask that a frame names, or one of its image's name in `masks`; else None."""
     name = frame.get("mask_path")
     check_type(f"frames[{index}].mask_path", name, str | None)
-    found = None if name is None else below(folder, name)
-    return found if found is not None and found.is_file() else None
+    if name is not None:
+        return below(folder, name)
+    image = Path(frame["file_path"])
+    return find_mask(folder, str(image.relative_to(image.parts[0]) if image.parts[1:] else image))
+
+
+def _missing_masks(masks: list[Path | None]) -> str | None:
+    """Describes masks that the file names and that are not there."""
+    gone = [mask for mask in masks if mask is not None and not os.path.isfile(mask)]
+    if not gone:
+        return None
+    return f"{len(gone)} of {len(masks)} masks are missing ({gone[0]}): nothing is masked there."
 
 
 def _smaller_copies(folder: Path, images: list[Path]) -> list[Path]:
@@ -288,6 +304,10 @@ def _value(fields: _Fields, name: str, otherwise: float | None = None) -> float:
 
 
 def _lens_of(fields: _Fields, width: int, height: int) -> Lens:
+    if fields.get("camera_model") == PANORAMA:
+        return Lens(PANORAMA, width, height, (float(width), float(height)))
+    if fields.get("camera_model") == DUAL_FISHEYE:
+        return Lens(DUAL_FISHEYE, width, height, (_value(fields, "fov"),))
     if "K" in fields and "fl_x" not in fields:
         K = _matrix("K", fields["K"], size=3)
         fields = {**fields, "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}

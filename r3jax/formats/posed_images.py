@@ -100,6 +100,12 @@ class Pixels:
     depth: Callable[[int], np.ndarray]
     """z-depth of an image, [h, w] float32 of any size, 0 no measurement; raises FormatError."""
 
+    mask: Callable[[int], np.ndarray] | None = None
+    """True where the pixels of an image count, [H, W]; None: all of them do."""
+
+    has_images: bool = True
+    """False if the images are missing."""
+
 
 @dataclass(frozen=True)
 class PosedImages:
@@ -156,6 +162,16 @@ class PosedImages:
 
     reconstruction: Reconstruction | None = None
     """Quality measures of the structure from motion; None: unknown."""
+
+    photo_of: np.ndarray | None = None
+    """Number of the photo that each image was cut from, [n]; None: each is a photo of its own."""
+
+    @property
+    def has_images(self) -> bool:
+        """True unless all images are missing."""
+        if self.pixels is not None:
+            return self.pixels.has_images
+        return any(path.is_file() for path in self.image_paths)
 
     def __len__(self) -> int:
         """Returns the number of images."""
@@ -245,7 +261,8 @@ class PosedImages:
             FormatError: the file is missing, broken or of another size.
         """
         if self.pixels is not None:
-            return self.pixels.rgb(index), None
+            mask = None if self.pixels.mask is None else self.pixels.mask(index)
+            return self.pixels.rgb(index), mask
         path, lens = self.image_paths[index], self.lenses[index]
         with naming(path):
             rgb, is_there = masked_pixels(path, IMAGE_FORMATS, (lens.width, lens.height))

@@ -18,6 +18,9 @@ from r3jax.validation.files import check_regular
 MAX_PIXELS = 1 << 24
 """Images with more pixels (4096 x 4096) come from no depth camera; as floats one takes 200 MB."""
 
+MAX_PHOTO = 1 << 27
+"""Photos with more pixels are not read; those of phones and 360 cameras have up to 108 million."""
+
 _ORIENTATION = 0x0112
 """EXIF's tag of how an image is turned when it is shown."""
 
@@ -105,6 +108,8 @@ def _other_size(image: Any, size: tuple[int, int]) -> str:
             f": its pixels are stored on their side (EXIF orientation {turn}), turn them by "
             "`mogrify -auto-orient`"
         )
+    else:
+        said += ": give the images that the poses were found with, not cropped or undistorted since"
     return said
 
 
@@ -155,6 +160,23 @@ def masked_pixels(
         return _colors(image)
 
 
+def small_gray(path: Path, formats: Sequence[str], size: tuple[int, int]) -> np.ndarray:
+    """Reads an image reduced to a few gray pixels, [h, w] uint8, to compare it with others.
+
+    Args:
+        path: the file.
+        formats: those that Pillow may try, such as "PNG".
+        size: width and height of the result [px].
+
+    Raises:
+        ForeignFileError: not an image of these formats, broken, or too large.
+        OSError: missing, or not permitted.
+    """
+    with _opened(path, formats) as image:
+        image.draft("L", (4 * size[0], 4 * size[1]))  # JPEG: decoded at a fraction of its size
+        return np.asarray(image.convert("L").resize(size, resample=4))  # 4: mean over each pixel
+
+
 def _check_size(image: Any, size: tuple[int, int] | None) -> None:
     if size is not None and image.size != size:
         raise ForeignFileError(_other_size(image, size))
@@ -200,14 +222,18 @@ def _opened(path: Path | bytes, formats: Sequence[str]) -> Generator[Any]:
             warnings.simplefilter("ignore")
             with Image.open(source, formats=tuple(formats)) as image:
                 width, height = image.size
-                if width * height > MAX_PIXELS:  # before a pixel is unpacked
+                if width * height > MAX_PHOTO:  # before a pixel is unpacked
                     raise ForeignFileError(
-                        f"the image is {width} x {height}: more than {MAX_PIXELS} pixels are not "
-                        "read"
+                        f"the image is {width} x {height}: more than {MAX_PHOTO} pixels are not "
+                        "read, so reduce the images"
                     )
                 yield image
     except (FileNotFoundError, ForeignFileError):
         raise
+    except Image.DecompressionBombError:
+        raise ForeignFileError(
+            f"more than {MAX_PHOTO} pixels are not read: reduce the images"
+        ) from None
     except UnidentifiedImageError:
         raise ForeignFileError(_no_image(source, formats)) from None
     except Exception as error:  # struct, zlib, syntax, overflow: every decoder has its own

@@ -19,8 +19,11 @@ from r3jax.captures.source import (
     sparse_depth,
     thinned,
 )
+from r3jax.formats.colmap.reader import read_colmap
+from r3jax.formats.errors import FormatError
 from r3jax.formats.lenses import MODELS, Lens
 from r3jax.formats.nerfstudio import read_transforms
+from r3jax.formats.points import write_points
 from r3jax.geometry.cameras import Camera
 from r3jax.validation.errors import ForeignFileError
 from tests.apps.audit.room import (
@@ -30,6 +33,7 @@ from tests.apps.audit.room import (
     picture,
     round_poses,
     wall_points,
+    write_colmap,
     write_nerfstudio,
 )
 
@@ -195,3 +199,34 @@ def test_depth_from_points_is_not_converted():
         replace(dense_source(), kind="cloud").with_depth(is_along_ray=True)
     with pytest.raises(ValueError, match="--depth-scale"):
         dense_source().with_depth(-1.0)
+
+
+def written(folder, poses, points):
+    path = write_nerfstudio(folder, poses, depth=False)
+    write_points(path / "points.ply", points, np.zeros((len(points), 3), np.uint8))
+    return read_transforms(path)
+
+
+def test_points_of_another_scene_or_scale_are_refused_with_the_numbers(tmp_path):
+    points, _ = wall_points()
+    assert len(source_of(written(tmp_path / "own", round_poses(), points), "room")) == 16
+    away = points + np.array([1000.0, 0.0, 0.0])
+    with pytest.raises(FormatError, match=r"points\.ply.* cameras .* 1e\+03 apart"):
+        source_of(written(tmp_path / "away", round_poses(), away), "room")
+    with pytest.raises(FormatError, match="cameras have none of its points"):
+        source_of(written(tmp_path / "small", round_poses(), points * 1e-3), "room")
+
+
+def test_poses_of_another_convention_are_refused(tmp_path):
+    path = write_colmap(tmp_path, round_poses())
+    images = read_colmap(path)
+    turned = images.poses @ np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's axes
+    with pytest.raises(FormatError, match="behind the cameras"):
+        source_of(replace(images, poses=turned), "room")
+
+
+def test_poses_that_are_placeholders_are_refused(tmp_path):
+    images = read_colmap(write_colmap(tmp_path, round_poses()))
+    same = np.repeat(images.poses[:1], len(images), axis=0)
+    with pytest.raises(FormatError, match="poses of all 16 images are equal"):
+        source_of(replace(images, poses=same), "room")

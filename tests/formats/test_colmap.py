@@ -12,7 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from r3jax.errors import InputError
 from r3jax.formats.colmap.binary import read_binary, write_binary
-from r3jax.formats.colmap.model import ColmapModel, colmap_pose, pose_of
+from r3jax.formats.colmap.model import (
+    ColmapImage,
+    ColmapModel,
+    colmap_pose,
+    points_without_tracks,
+    pose_of,
+)
 from r3jax.formats.colmap.reader import read_colmap
 from r3jax.formats.colmap.text import read_text, write_text
 from r3jax.formats.errors import FormatError
@@ -142,6 +148,43 @@ def test_of_several_models_the_one_with_most_images_is_taken(split):
     asked_for = read_colmap(folder / "sparse" / "0")
     assert len(asked_for) == counts["0"]
     assert asked_for.remark is None
+
+
+def part_of(names: list[str]) -> ColmapModel:
+    """A model of some pictures, without points."""
+    none = np.zeros((0, 2)), np.zeros(0, np.int64)
+    images = tuple(
+        ColmapImage(i, name, 1, np.array([1.0, 0, 0, 0]), np.array([i, 0.0, 0]), *none)
+        for i, name in enumerate(names, start=1)
+    )
+    lens = Lens("PINHOLE", 40, 30, (33.0, 33.0, 20.0, 15.0))
+    return ColmapModel(
+        {1: lens}, images, points_without_tracks(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    )
+
+
+@pytest.mark.parametrize("alike", [False, True])
+def test_the_place_is_named_where_pictures_would_join_two_models(tmp_path, alike):
+    names = [f"{i:02d}.png" for i in range(12)]
+    parts = {"0": names[:7], "1": names[8:], "2": names[2:5], "3": [*names[:3], "99.png"]}
+    (tmp_path / "images").mkdir()
+    rng = np.random.default_rng(0)
+    looks = {name: rng.integers(0, 255, (30, 40, 3), np.uint8) for name in [*names, "99.png"]}
+    if alike:  # the walk came back here
+        looks["10.png"] = looks["02.png"]
+    for name, look in looks.items():
+        Image.fromarray(look).resize((40, 30)).save(tmp_path / "images" / name)
+    for number, part in parts.items():
+        (tmp_path / "sparse" / number).mkdir(parents=True)
+        write_binary(tmp_path / "sparse" / number, part_of(part))
+    remark = read_colmap(tmp_path).remark
+    assert remark is not None
+    ends = ("02.png", "10.png") if alike else ("06.png", "08.png")
+    assert f"pictures between {ends[0]} and {ends[1]}" in remark
+    assert "sparse/2 has 3 of the same" in remark
+    assert "3 of them in both: colmap model_merger" in remark
+    assert "no model has 07.png" in remark
+    assert len(read_colmap(tmp_path / "sparse")) == 7  # the folder of the models
 
 
 def test_pictures_without_a_pose_are_counted(capture):

@@ -29,6 +29,10 @@ FOLDERS = {
         {"cameras.xml": b"", "images/1.jpg": b""},
         r"Metashape: ns-process-data metashape --data \S+scan --xml \S+scan/cameras\.xml",
     ),
+    "images beside a program's own folder": (
+        {".idea/misc.xml": b"", "images/1.jpg": b""},
+        r"ns-process-data images --data \S+scan/images ",
+    ),
     "exr": ({"rgb/0.jpg": b"", "depth/0.exr": b""}, r"Record3D's export .*without metadata\.json"),
     "exr below": ({"EXR_RGBD/depth/0.exr": b""}, r"Record3D's export .*metadata\.json .*EXR_RGBD"),
     "tum": (

@@ -43,7 +43,10 @@ def test_a_camera_comes_back():
 @pytest.mark.parametrize(
     ("fields", "reason"),
     [
-        (("EQUIRECTANGULAR", 10, 10, (10.0, 10.0)), "EQUIRECTANGULAR"),
+        (("CYLINDER", 10, 10, (10.0, 10.0)), "CYLINDER"),
+        (("EQUIRECTANGULAR", 20, 10, (20.0,)), "w h.*1"),
+        (("EQUIRECTANGULAR", 20, 10, (40.0, 20.0)), "20 x 10.*40 20"),
+        (("EQUIRECTANGULAR", 20, 8, (20.0, 8.0)), "20 x 8"),
         (("PINHOLE", 10, 10, (10.0, 5.0, 5.0)), "fx fy cx cy.*3"),
         (("PINHOLE", 0, 10, (10.0, 10.0, 5.0, 5.0)), "0 x 10 pixels"),
         (("PINHOLE", 10, 1 << 40, (10.0, 10.0, 5.0, 5.0)), "pixels"),

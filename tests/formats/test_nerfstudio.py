@@ -206,3 +206,22 @@ def test_what_is_missing_is_named_when_it_is_read(folder):
     assert len(read_transforms(folder)) == 2
     with pytest.raises(FormatError, match=r"b\.png"):
         images.frame(0)
+
+
+def test_masks_are_those_that_are_named_or_lie_in_their_folder(folder):
+    (folder / "masks").mkdir()
+    mask = np.zeros((8, 10), np.uint8)
+    mask[:, :5] = 255
+    for name in ("masks/b.png", "own.png"):
+        Image.fromarray(mask).save(folder / name)
+    found = read_transforms(written(folder))
+    assert found.mask_paths == (folder / "masks" / "b.png", None)
+    is_there = found.masked_rgb(0)[1]
+    assert is_there is not None
+    np.testing.assert_array_equal(is_there, mask > 0)
+    named = read_transforms(written(folder, **{"0.mask_path": "own.png"}))
+    assert named.mask_paths == (folder / "own.png", None)
+    gone = read_transforms(written(folder, **{"0.mask_path": "gone.png"}))
+    assert gone.mask_paths is None
+    assert gone.remark is not None
+    assert "gone.png" in gone.remark

@@ -212,7 +212,9 @@ def _promises(audit: Audit) -> list[str]:
     what = "What a picture shows" if audit.is_own_path else "What a frame of the path shows"
     by = "by the others" if audit.is_own_path else "by the pictures"
     beside = "" if audit.source.is_complete else ", where it is known"
-    if audit.is_saturated:
+    if np.isnan(worst.score.renderability):
+        sentences.append(f"{what} is not known: no surface was found in any of its frames.")
+    elif audit.is_saturated:
         sentences.append(f"{what} was seen {by} with R {mean:.2f} on average. {saturation()}")
     else:
         sentences.append(

@@ -83,10 +83,12 @@ def write_data_set(
     files = _Files(folder, copies)
     _clear(folder)
     source, kept = capture.source, found.kept
-    if isinstance(source, PosedImages) and (transforms := _transforms_of(source.path)) is not None:
-        data_set = _reduce_transforms(transforms, source, kept, files, on_frame)
-    elif isinstance(source, PosedImages) and (found_model := _model_of(source)) is not None:
-        data_set = _reduce_model(*found_model, source, kept, files, on_frame)
+    # Views cut from 360 photos are in no file of the capture: they are written.
+    original = source if isinstance(source, PosedImages) and source.photo_of is None else None
+    if original and (transforms := _transforms_of(original.path)) is not None:
+        data_set = _reduce_transforms(transforms, original, kept, files, on_frame)
+    elif original and (found_model := _model_of(original)) is not None:
+        data_set = _reduce_model(*found_model, original, kept, files, on_frame)
     else:
         data_set = _write_transforms(found, source, kept, files, on_frame)
     record = folder / RECORD

@@ -146,15 +146,22 @@ def _directions(image: BlockImage, blocks: np.ndarray) -> np.ndarray:
     return offset / np.linalg.norm(offset, axis=1, keepdims=True)
 
 
+_LARGEST_TURN = np.radians(60.0)
+"""Between frames that follow each other [rad]."""
+
+
 def image_motion(images: Sequence[BlockImage]) -> np.ndarray:
     """Computes the motion of the image between frames, [n] [share of the image's width].
 
     A turn by an angle moves it by the focal length times as much; a step by that over the depth.
-    Each frame has the larger of the motions before and after it; a single frame has 0.
+    Each frame has the larger of the motions before and after it; a single frame has 0. A larger
+    turn than a video has is no motion: views of one 360 photo, or pictures of another pass.
     """
     speed = np.zeros(len(images))
     for i, (a, b) in enumerate(pairwise(images)):
         turn = np.arccos(np.clip(float(a.pose[:3, 2] @ b.pose[:3, 2]), -1.0, 1.0))
+        if turn > _LARGEST_TURN:
+            continue
         depth = np.nanmin([a.median_depth, b.median_depth, np.inf])
         step = float(np.linalg.norm(a.pose[:3, 3] - b.pose[:3, 3])) / depth
         moved = float(a.camera.fx) * (turn + step) / a.camera.width

@@ -47,7 +47,9 @@ def run_audit(options: AuditOptions) -> int:
         with tempfile.TemporaryDirectory(prefix="r3jax-") as scratch:
             _follow(options, Path(scratch), progress)
     else:
-        capture = open_capture(options.capture, "z", parse_topics(options.topics))
+        capture = open_capture(
+            options.capture, "z", parse_topics(options.topics), options.terms.cut
+        )
         path = None if options.path is None else path_of(options.path, capture.source)
         _audit(options, source_of(capture.source, capture.name), path, progress)
     return 0

@@ -26,7 +26,7 @@ def run_select(options: SelectOptions) -> int:
     progress, console = Console(stderr=True), Console()
     if is_video(options.capture):
         return _select_video(options, progress, console)
-    capture = open_capture(options.capture, "z", parse_topics(options.topics))
+    capture = open_capture(options.capture, "z", parse_topics(options.topics), options.terms.cut)
     source = source_of(capture.source, capture.name)
     folder = options.out or Path("runs") / "select" / source.name
     check_own(folder, "selection", "give another --out")

@@ -19,7 +19,7 @@ _GROWING = (".json", ".mcap", ".db3", ".bag", ".active")
 
 _TERMS = FieldsOf(
     "views", "voxel_size", "max_range", "up", "max_frames", "folds", "seed", "depth_scale",
-    "depth_along_ray", "trust_depth", "surfaces", "model",
+    "depth_along_ray", "trust_depth", "surfaces", "model", "hide_below", "overlap_360",
 )  # fmt: skip
 
 

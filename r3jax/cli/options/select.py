@@ -18,7 +18,7 @@ from r3jax.formats.video import is_video
 _TERMS = FieldsOf(
     "frames", "share", "gain", "targets", "keep", "drop_blurred", "drop_duplicates", "exact",
     "voxel_size", "max_range", "up", "max_frames", "depth_scale", "depth_along_ray", "trust_depth",
-    "surfaces", "model",
+    "surfaces", "model", "hide_below", "overlap_360",
 )  # fmt: skip
 
 
