@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from r3jax.formats.colmap.model import ColmapImage, ColmapModel, ColmapPoints
-from r3jax.formats.lenses import MODELS, Lens
+from r3jax.formats.lenses import MODELS, PANORAMA, Lens
 
 NAMES = ("a.png", "sub folder/b c  d.jpg", "ünï.png", "#7.png", "8")
 """With blanks, not ASCII, like a comment, like a number."""
@@ -31,8 +31,11 @@ def random_pose(seed: int) -> np.ndarray:
 
 def random_lens(rng: np.random.Generator) -> Lens:
     """Any model, with distortion."""
-    names = list(MODELS)
+    names = [name for name, (number, _) in MODELS.items() if number >= 0]  # of COLMAP
     model = names[rng.integers(len(names))]
+    if model == PANORAMA:
+        height = int(rng.integers(1, 5000))
+        return Lens(model, 2 * height, height, (2.0 * height, float(height)))
     params = rng.normal(0.0, 0.1, len(MODELS[model][1]))
     focals = 1 if MODELS[model][1][0] == "f" else 2
     params[:focals] = rng.uniform(10.0, 5000.0, focals)

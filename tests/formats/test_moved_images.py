@@ -107,9 +107,10 @@ def test_a_scaled_image_has_the_shape_of_its_lens(size, fits):
 @pytest.mark.parametrize("model", MODELS)
 def test_a_resized_lens_shows_the_same(model):
     """Focal lengths and principal points scale, distortion has no unit."""
-    names = MODELS[model][1]
-    lens = Lens(model, 40, 30, tuple(10.0 + i for i in range(len(names))))
-    half = lens.resized(20, 15)
+    whole = {"EQUIRECTANGULAR": (40.0, 20.0), "DUAL_FISHEYE": (200.0,)}
+    params = whole.get(model, tuple(10.0 + i for i in range(len(MODELS[model][1]))))
+    lens = Lens(model, 40, 20, params)
+    half = lens.resized(20, 10)
     np.testing.assert_allclose(half.intrinsics, np.array(lens.intrinsics) / 2)
     assert half.distortion == lens.distortion
-    assert half.resized(40, 30) == lens
+    assert half.resized(40, 20) == lens

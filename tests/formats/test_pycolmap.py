@@ -136,13 +136,15 @@ def test_names_with_blanks_survive_in_binary(tmp_path):
     assert_agree(pycolmap.Reconstruction(str(tmp_path)), model)
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", [name for name, (number, _) in MODELS.items() if number >= 0])
 def test_every_camera_model_has_colmaps_number_and_parameters(model):
     number, names = MODELS[model]
-    camera = pycolmap.Camera.create_from_model_name(1, model, 100.0, 64, 48)
+    camera = pycolmap.Camera.create_from_model_name(1, model, 100.0, 64, 32)
     assert int(camera.model) == number
     assert camera.params_info.replace(" ", "").split(",") == list(names)
-    lens = Lens(model, 64, 48, tuple(camera.params))
+    lens = Lens(model, 64, 32, tuple(camera.params))
+    if lens.is_panorama:  # COLMAP knows no focal length of it
+        return
     np.testing.assert_allclose(
         [camera.focal_length_x, camera.focal_length_y]
         if len(camera.focal_length_idxs()) == 2

@@ -273,12 +273,15 @@ class GrowingCapture:
 
 def subset(source: Source, indices: list[int]) -> Source:
     """Selects frames of a capture by index."""
+    photograph, photo_of = source.photograph, source.photo_of
     return dataclasses.replace(
         source,
         poses=source.poses[indices],
         lenses=tuple(source.lenses[i] for i in indices),
         labels=tuple(source.labels[i] for i in indices),
         read=lambda index: source.read(indices[index]),
+        photograph=photograph and (lambda index, by: photograph(indices[index], by)),
+        photo_of=None if photo_of is None else photo_of[indices],
     )
 
 
