@@ -25,9 +25,7 @@ from jaxtyping import Array, Float
 
 from r3jax.kernels import sweep as kernels
 from r3jax.kernels.constants import LEAST_DEVIATION, NO_SCORE
-
-RADIUS = 3
-"""Of the windows that are compared [px]."""
+from r3jax.kernels.constants import SWEEP_RADIUS as RADIUS
 
 PLANES = 128
 """Planes at most."""
@@ -278,7 +276,7 @@ def swept_depth(reference: Photo, sources: Sequence[Photo], depths: np.ndarray) 
     stack = np.zeros((len(sources), *sizes.max(axis=0)), np.float32)
     for number, source in enumerate(sources):
         stack[number, : source.gray.shape[0], : source.gray.shape[1]] = source.gray
-    scores = kernels.plane_scores(reference.gray, stack, sizes, where.A, where.b, planes, RADIUS)
+    scores = kernels.plane_scores(reference.gray, stack, sizes, where.A, where.b, planes)
     smooth = kernels.smooth_scores(scores, np.float32(_SMALL_STEP), np.float32(_LARGE_STEP))
     inverse, score = best_planes(smooth, planes)
     is_good = (score >= _MIN_SCORE) & (inverse > 0.0)

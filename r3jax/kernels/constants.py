@@ -124,6 +124,9 @@ MISSES_OF_FEW = 2
 MISSES = 3
 """The same for a voxel of more observations."""
 
+SWEEP_RADIUS = 3
+"""Of the windows that a plane sweep compares [px]."""
+
 LEAST_DEVIATION = 0.008
 """Windows whose brightness deviates by less (two of 255 steps) have no texture to compare."""
 

@@ -1,10 +1,10 @@
 """Plane sweep: the depth of an image's pixels by comparing it with others, in machine code.
 
-The formulas: `plane_scores` and `smooth_scores` of `captures.sweep`. An image is cut into bands of
-rows; a thread sweeps one band at a time through all planes, so that its scratch memory stays in the
-cache.
+The formulas: `plane_scores` and `smooth_scores` of `captures.sweep`. A thread takes a band of rows
+at a time through all planes. Of a source it samples one row after another; sums over the columns
+of a window slide down with it, in memory that stays in the cache.
 
-Shape symbols: s sources; h, w size of the reference; p planes; b rows of a band with its margin.
+Shape symbols: s sources; h, w size of the reference; p planes; n rows of a band.
 """
 
 # Kernels have the types that Numba infers where they are called; annotations it would not read.
@@ -16,199 +16,220 @@ import math
 import numpy as np
 from numba import prange
 
-from r3jax.kernels.constants import LEAST_DEVIATION, NO_SCORE
+from r3jax.kernels.constants import LEAST_DEVIATION, NO_SCORE, SWEEP_RADIUS
 from r3jax.kernels.native.compiled import called_from_python, inlined_fast
 
-_BAND = 16
+_BAND = 32
 """Rows of a band."""
+
+_SIDE = 2 * SWEEP_RADIUS + 1
+"""Of a window [px]. A constant: the loops over it are unrolled."""
 
 
 @inlined_fast
-def _warp(source, size, A, b, inverse, first, value, squared, product, reference, is_in):
-    """Samples a source at the pixels of a band, as if all lay in one plane.
+def _project(size, A, b, inverse, row, stride, at, part_x, part_y, is_in):
+    """Projects a row of the reference into a source, as if all of it lay in one plane.
 
     Args:
-        source: [H, W] float32; its upper left part of `size` counts.
-        size: rows and columns of the source, [2].
+        size: rows and columns of the source, [2], two each or more.
         A: projects a pixel of the reference at depth 1 into the source, [3, 3].
         b: what an inverse depth adds to it, [3].
         inverse: one over the plane's depth.
-        first: row of the reference that the band begins with; may be negative.
-        value: takes the samples, [b, w].
-        squared: takes their squares, [b, w].
-        product: takes their products with the reference, [b, w].
-        reference: [h, w].
-        is_in: takes whether a pixel lies in the source, [b, w].
+        row: of the reference.
+        stride: from one row of the source to the next, in memory.
+        at: takes the index of the source's pixel to the upper left, [w] uint32: an index without
+            a sign need not be checked for counting from the end.
+        part_x: takes the way from it to the next column, [w].
+        part_y: takes the way from it to the next row, [w].
+        is_in: takes 1 where a pixel lies in the source, else 0, [w].
     """
-    height, width = reference.shape
-    rows, columns = size[0], size[1]
-    half = np.float32(0.5)
-    for i in range(value.shape[0]):
-        row = min(max(first + i, 0), height - 1)
-        v = np.float32(row) + half
-        x0 = A[0, 1] * v + A[0, 2] + inverse * b[0]
-        y0 = A[1, 1] * v + A[1, 2] + inverse * b[1]
-        z0 = A[2, 1] * v + A[2, 2] + inverse * b[2]
-        for j in range(width):
-            u = np.float32(j) + half
-            z = A[2, 0] * u + z0
-            inside = z > np.float32(1e-6)
-            per_z = np.float32(1.0) / z if inside else np.float32(0.0)
-            x = (A[0, 0] * u + x0) * per_z - half
-            y = (A[1, 0] * u + y0) * per_z - half
-            inside &= (x >= -half) & (x <= np.float32(columns) - half)
-            inside &= (y >= -half) & (y <= np.float32(rows) - half)
-            x = min(max(x, np.float32(0.0)), np.float32(columns - 1))
-            y = min(max(y, np.float32(0.0)), np.float32(rows - 1))
-            left, top = int(x), int(y)
-            right, bottom = min(left + 1, columns - 1), min(top + 1, rows - 1)
-            fx, fy = x - np.float32(left), y - np.float32(top)
-            upper = source[top, left] + fx * (source[top, right] - source[top, left])
-            lower = source[bottom, left] + fx * (source[bottom, right] - source[bottom, left])
-            sample = upper + fy * (lower - upper)
-            value[i, j] = sample
-            squared[i, j] = sample * sample
-            product[i, j] = sample * reference[row, j]
-            is_in[i, j] = inside
+    zero, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
+    least = np.float32(1e-6)
+    bottom, right = np.float32(size[0]), np.float32(size[1])
+    last_row, last_column = np.int32(size[0] - 2), np.int32(size[1] - 2)
+    v = np.float32(row) + half
+    x0 = A[0, 1] * v + A[0, 2] + inverse * b[0]
+    y0 = A[1, 1] * v + A[1, 2] + inverse * b[1]
+    z0 = A[2, 1] * v + A[2, 2] + inverse * b[2]
+    per_x, per_y, per_z = A[0, 0], A[1, 0], A[2, 0]
+    for j in range(at.shape[0]):
+        u = np.float32(np.int32(j)) + half
+        z = per_z * u + z0
+        scale = one / max(z, least)
+        x, y = (per_x * u + x0) * scale, (per_y * u + y0) * scale
+        inside = (z > least) & (x >= zero) & (x <= right) & (y >= zero) & (y <= bottom)
+        is_in[j] = one if inside else zero
+        x = min(max(x - half, zero), right - one)
+        y = min(max(y - half, zero), bottom - one)
+        left, top = min(np.int32(x), last_column), min(np.int32(y), last_row)
+        part_x[j], part_y[j] = x - np.float32(left), y - np.float32(top)
+        at[j] = np.uint32(top * np.int32(stride) + left)
 
 
 @inlined_fast
-def _box(values, radius, line, out):
-    """Sums over windows of 2 radius + 1: rows shrink by the margin, columns repeat at the rim.
+def _sample(source, stride, at, part_x, part_y, values):
+    """Interpolates a source, flat in memory, at the places of `_project`."""
+    beside, below = np.uint32(1), np.uint32(stride)
+    for j in range(at.shape[0]):
+        k = at[j]
+        upper = source[k] + part_x[j] * (source[k + beside] - source[k])
+        k += below
+        lower = source[k] + part_x[j] * (source[k + beside] - source[k])
+        values[j] = upper + part_y[j] * (lower - upper)
+
+
+@inlined_fast
+def _slide(values, reference, ring, columns):
+    """Moves the windows down by a row.
 
     Args:
-        values: [b, w].
-        radius: of the window.
-        line: scratch, [w + 2 radius].
-        out: takes the sums, [b - 2 radius, w].
+        values: the row that comes in, [w].
+        reference: the same row of the reference, [w].
+        ring: the row that goes out: values, their squares, their products with the reference,
+            [3, w]; takes those of the row that comes in.
+        columns: sums of each over the rows of a window, [3, w + 2 radius].
     """
-    width = values.shape[1]
-    # Columns in the inner loops: these are vectorized.
-    for i in range(out.shape[0]):
-        for j in range(width):
-            line[radius + j] = values[i, j]
-        for k in range(1, 2 * radius + 1):
-            for j in range(width):
-                line[radius + j] += values[i + k, j]
-        for k in range(radius):
-            line[k] = line[radius]
-            line[radius + width + k] = line[radius + width - 1]
-        for j in range(width):
-            out[i, j] = line[j]
-        for k in range(1, 2 * radius + 1):
-            for j in range(width):
-                out[i, j] += line[j + k]
+    for j in range(values.shape[0]):
+        value = values[j]
+        squared, product = value * value, value * reference[j]
+        columns[0, SWEEP_RADIUS + j] += value - ring[0, j]
+        columns[1, SWEEP_RADIUS + j] += squared - ring[1, j]
+        columns[2, SWEEP_RADIUS + j] += product - ring[2, j]
+        ring[0, j], ring[1, j], ring[2, j] = value, squared, product
 
 
 @inlined_fast
-def _join(sums, of_reference, is_in, radius, best, second, third, count):
+def _repeat_rim(columns, width):
+    """Repeats the first and the last column where windows reach beyond the image."""
+    for q in range(columns.shape[0]):
+        for k in range(SWEEP_RADIUS):
+            columns[q, k] = columns[q, SWEEP_RADIUS]
+            columns[q, SWEEP_RADIUS + width + k] = columns[q, SWEEP_RADIUS + width - 1]
+
+
+@inlined_fast
+def _describe(columns, means, roots):
+    """Computes means and inverse deviations of windows; the latter are 0 without texture, [w]."""
+    zero, one = np.float32(0.0), np.float32(1.0)
+    per = np.float32(1.0 / (_SIDE * _SIDE))
+    for j in range(means.shape[0]):
+        total, squares = zero, zero
+        for k in range(_SIDE):
+            total += columns[0, j + k]
+            squares += columns[1, j + k]
+        means[j] = total * per
+        variance = squares * per - means[j] * means[j]
+        textured = variance > np.float32(LEAST_DEVIATION * LEAST_DEVIATION)
+        safe = variance if textured else one
+        roots[j] = one / np.float32(math.sqrt(safe)) if textured else zero
+
+
+@inlined_fast
+def _join(columns, means, roots, is_in, best):
     """Turns sums over windows into correlations, and keeps the three best of each pixel.
 
     Args:
-        sums: of the samples, their squares, their products with the reference, [3, n, w].
-        of_reference: sum and inverse root of the variance of the reference, [2, n, w]; the latter
-            is 0 where the window has no texture.
-        is_in: whether a pixel lies in the source, [b, w].
-        radius: of the window.
-        best: [n, w].
-        second: [n, w].
-        third: [n, w].
-        count: number of sources that show a pixel, [n, w].
+        columns: as in `_slide`.
+        means: of the reference's windows, [w].
+        roots: their inverse deviations, [w].
+        is_in: 1 where a pixel lies in the source, else 0, [w].
+        best: the three best correlations and the number of sources that show a pixel, [4, w].
     """
-    side = np.float32(2 * radius + 1)
-    per = np.float32(1.0) / (side * side)
+    zero, one, none = np.float32(0.0), np.float32(1.0), np.float32(NO_SCORE)
+    per = np.float32(1.0 / (_SIDE * _SIDE))
     least = np.float32(LEAST_DEVIATION * LEAST_DEVIATION)
-    none = np.float32(NO_SCORE)
-    for i in range(best.shape[0]):
-        for j in range(best.shape[1]):
-            mean = sums[0, i, j] * per
-            variance = sums[1, i, j] * per - mean * mean
-            covariance = sums[2, i, j] * per - mean * (of_reference[0, i, j] * per)
-            is_valid = is_in[i + radius, j] & (variance > least)
-            safe = variance if is_valid else np.float32(1.0)
-            score = covariance * of_reference[1, i, j] / np.float32(math.sqrt(safe))
-            score = score if is_valid else none
-            a, b, c = best[i, j], second[i, j], third[i, j]
-            low = min(a, score)
-            best[i, j] = max(a, score)
-            low, second[i, j] = min(b, low), max(b, low)
-            third[i, j] = max(c, low)
-            count[i, j] += np.float32(1.0) if is_valid else np.float32(0.0)
+    for j in range(means.shape[0]):
+        total, squares, products = zero, zero, zero
+        for k in range(_SIDE):
+            total += columns[0, j + k]
+            squares += columns[1, j + k]
+            products += columns[2, j + k]
+        mean = total * per
+        variance = squares * per - mean * mean
+        covariance = products * per - mean * means[j]
+        is_valid = (is_in[j] > zero) & (variance > least)
+        safe = variance if is_valid else one
+        score = covariance * roots[j] / np.float32(math.sqrt(safe))
+        score = score if is_valid else none
+        first, second, third = best[0, j], best[1, j], best[2, j]
+        low = min(first, score)
+        best[0, j] = max(first, score)
+        best[1, j] = max(second, low)
+        best[2, j] = max(third, min(second, low))
+        best[3, j] += one if is_valid else zero
+
+
+@inlined_fast
+def _mean(best, roots, scores, plane):
+    """Writes the mean of the three best correlations, or of two, [w, p]."""
+    for j in range(roots.shape[0]):
+        two = best[0, j] + best[1, j]
+        three = (two + best[2, j]) / np.float32(3.0)
+        score = three if best[3, j] >= np.float32(3.0) else np.float32(0.5) * two
+        is_known = (roots[j] > np.float32(0.0)) & (best[3, j] >= np.float32(2.0))
+        scores[j, plane] = score if is_known else np.float32(NO_SCORE)
 
 
 @called_from_python(parallel=True)
-def plane_scores(reference, sources, sizes, A, b, inverses, radius):
-    """Compares each pixel with the sources on each plane.
+def plane_scores(reference, sources, sizes, A, b, inverses):
+    """Compares each pixel with the sources on each plane, by windows of `SWEEP_RADIUS`.
 
     Args:
         reference: brightness of the image, [h, w] float32.
         sources: of the others, [s, H, W] float32.
-        sizes: rows and columns of each, [s, 2] int64; they may be smaller than [H, W].
-        A: [s, 3, 3] float32, as in `_warp`.
+        sizes: rows and columns of each, [s, 2] int64; they may be smaller than [H, W]. Sources of
+            one row or column do not count.
+        A: [s, 3, 3] float32, as in `_project`.
         b: [s, 3] float32.
         inverses: one over the planes' depths, [p] float32.
-        radius: of the window [px].
 
     Returns:
         Mean correlation with the best three sources, [h, w, p] float32; `NO_SCORE` where fewer than
         two of them show the pixel or its window has no texture.
     """
     height, width = reference.shape
-    planes, num = inverses.shape[0], sources.shape[0]
-    scores = np.empty((height, width, planes), np.float32)
-    bands = -(-height // _BAND)
-    none = np.float32(NO_SCORE)
-    side = np.float32(2 * radius + 1)
-    per = np.float32(1.0) / (side * side)
-    for band in prange(bands):
-        top = band * _BAND
-        n = min(_BAND, height - top)
-        m = n + 2 * radius
-        warped = np.empty((3, m, width), np.float32)
-        is_in = np.empty((m, width), np.bool_)
-        line = np.empty(width + 2 * radius, np.float32)
-        sums = np.empty((3, n, width), np.float32)
-        of_reference = np.empty((2, n, width), np.float32)
-        for i in range(m):
-            row = min(max(top - radius + i, 0), height - 1)
-            for j in range(width):
-                warped[0, i, j] = reference[row, j]
-                warped[1, i, j] = reference[row, j] * reference[row, j]
-        _box(warped[0], radius, line, of_reference[0])
-        _box(warped[1], radius, line, of_reference[1])
-        for i in range(n):
-            for j in range(width):
-                mean = of_reference[0, i, j] * per
-                variance = of_reference[1, i, j] * per - mean * mean
-                textured = variance > np.float32(LEAST_DEVIATION * LEAST_DEVIATION)
-                safe = variance if textured else np.float32(1.0)
-                root = np.float32(1.0) / np.float32(math.sqrt(safe))
-                of_reference[1, i, j] = root if textured else np.float32(0.0)
-        best = np.empty((n, width), np.float32)
-        second = np.empty((n, width), np.float32)
-        third = np.empty((n, width), np.float32)
-        count = np.empty((n, width), np.float32)
-        for plane in range(planes):
-            best[:], second[:], third[:], count[:] = none, none, none, np.float32(0.0)
-            for s in range(num):
-                _warp(
-                    sources[s], sizes[s], A[s], b[s], inverses[plane], top - radius,
-                    warped[0], warped[1], warped[2], reference, is_in,
-                )  # fmt: skip
-                _box(warped[0], radius, line, sums[0])
-                _box(warped[1], radius, line, sums[1])
-                _box(warped[2], radius, line, sums[2])
-                _join(sums, of_reference, is_in, radius, best, second, third, count)
+    stride = sources.shape[2]
+    scores = np.empty((height, width, inverses.shape[0]), np.float32)
+    zero, none = np.float32(0.0), np.float32(NO_SCORE)
+    for band in prange(-(-height // _BAND)):
+        first = band * _BAND
+        n = min(_BAND, height - first)
+        at = np.empty(width, np.uint32)
+        part_x, part_y = np.empty(width, np.float32), np.empty(width, np.float32)
+        values = np.empty(width, np.float32)
+        ring = np.zeros((_SIDE, 3, width), np.float32)
+        is_in = np.empty((_SIDE, width), np.float32)
+        columns = np.zeros((3, width + 2 * SWEEP_RADIUS), np.float32)
+        means, roots = np.empty((n, width), np.float32), np.empty((n, width), np.float32)
+        best = np.empty((n, 4, width), np.float32)
+        for i in range(n + 2 * SWEEP_RADIUS):
+            row = min(max(first - SWEEP_RADIUS + i, 0), height - 1)
+            _slide(reference[row], reference[row], ring[i % _SIDE], columns)
+            if i >= 2 * SWEEP_RADIUS:
+                _repeat_rim(columns, width)
+                _describe(columns, means[i - 2 * SWEEP_RADIUS], roots[i - 2 * SWEEP_RADIUS])
+        for plane in range(inverses.shape[0]):
+            best[:, :3] = none
+            best[:, 3] = zero
+            for s in range(sources.shape[0]):
+                if sizes[s, 0] < 2 or sizes[s, 1] < 2:
+                    continue
+                ring[:] = zero
+                columns[:] = zero
+                for i in range(n + 2 * SWEEP_RADIUS):
+                    row = min(max(first - SWEEP_RADIUS + i, 0), height - 1)
+                    _project(
+                        sizes[s], A[s], b[s], inverses[plane], row, stride,
+                        at, part_x, part_y, is_in[i % _SIDE],
+                    )  # fmt: skip
+                    _sample(sources[s].reshape(-1), stride, at, part_x, part_y, values)
+                    _slide(values, reference[row], ring[i % _SIDE], columns)
+                    if i >= 2 * SWEEP_RADIUS:
+                        _repeat_rim(columns, width)
+                        out, middle = i - 2 * SWEEP_RADIUS, (i - SWEEP_RADIUS) % _SIDE
+                        _join(columns, means[out], roots[out], is_in[middle], best[out])
             for i in range(n):
-                for j in range(width):
-                    score = none
-                    if of_reference[1, i, j] > 0.0 and count[i, j] >= 2:
-                        score = best[i, j] + second[i, j]
-                        if count[i, j] >= 3:
-                            score = (score + third[i, j]) / np.float32(3.0)
-                        else:
-                            score = score / np.float32(2.0)
-                    scores[top + i, j, plane] = score
+                _mean(best[i], roots[i], scores[first + i], plane)
     return scores
 
 

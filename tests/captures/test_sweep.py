@@ -59,7 +59,7 @@ def test_the_kernel_compares_as_the_formula_does(seed, num):
     where = homographies(reference, sources)
     stack = np.stack([source.gray for source in sources])
     sizes = np.array([source.gray.shape for source in sources], np.int64)
-    found = kernels.plane_scores(plain, stack, sizes, where.A, where.b, PLANES, RADIUS)
+    found = kernels.plane_scores(plain, stack, sizes, where.A, where.b, PLANES)
     by_formula = formulas.plane_scores(*map(jnp.asarray, (plain, stack, where.A, where.b, PLANES)))
     by_formula = np.asarray(by_formula)
     # At the rim of a source, or of what counts as texture, rounding decides.
@@ -81,7 +81,7 @@ def test_a_source_smaller_than_the_others_counts_as_it_is():
     sizes = np.array([photo.gray.shape for photo in photos[1:]], np.int64)
     stack = np.stack([photo.gray for photo in photos[1:]])
     padded = np.pad(stack, ((0, 0), (0, 5), (0, 7)), constant_values=0.9)
-    arguments = sizes, where.A, where.b, PLANES, RADIUS
+    arguments = sizes, where.A, where.b, PLANES
     np.testing.assert_array_equal(
         kernels.plane_scores(photos[0].gray, stack, *arguments),
         kernels.plane_scores(photos[0].gray, padded, *arguments),
