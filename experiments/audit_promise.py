@@ -181,7 +181,13 @@ def obtained(before: Audit, source: Source) -> dict[str, float]:
     cameras = survey.alignment.points(source.poses[survey.chosen, :3, 3])
     meter = survey.alignment.scale
     places = places_of(
-        seen.state, seen.grid, cameras, AuditSettings.num_places, is_dense=True, meter=meter
+        seen.state,
+        seen.grid,
+        cameras,
+        AuditSettings.num_places,
+        is_dense=True,
+        meter=meter,
+        with_cameras=True,
     )
     there = survey.alignment.points(before.survey.alignment.points_back(before.standpoints))
 

@@ -4,6 +4,8 @@ With depth images the places lie in known free space, at a margin from everythin
 to be free, connected to the camera's positions, and at heights at which the camera was held.
 Without depth images, they lie within the hull of the camera's positions and a margin around it, at
 a margin from every voxel, and where a camera was or a ray to a point passed, so not inside walls.
+Where a camera was, one can be held, too: an audit has these places among the others, so that what
+it says depends less on how much of the space is known to be free.
 If the floor is known, a person must also be able to stand there, or to reach there at arm's length.
 
 Cameras that look inward, around an object on a table or a statue, do not show where people stand.
@@ -36,7 +38,7 @@ _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1
 
 
 _FEWEST = 24
-"""With fewer places in free space, the camera's own positions are added."""
+"""With fewer places in free space, the cameras' own positions are added."""
 
 _OVER = 4
 """At most one in this number of places is reached only at arm's length."""
@@ -81,6 +83,7 @@ def places_of(
     is_dense: bool,
     meter: float | None,
     center: np.ndarray | None = None,
+    with_cameras: bool = False,
 ) -> Places:
     """Spreads places where a person could hold a camera.
 
@@ -92,6 +95,7 @@ def places_of(
         is_dense: True if depth images show where space is free.
         meter: length of a meter [audit units]; None if the capture's unit is not known.
         center: center of an object that the cameras surround; None if there is none.
+        with_cameras: True to have the cameras' own positions among the places, but for a dome.
 
     Returns:
         Places in known free space; if there are few, also the cameras' own positions.
@@ -104,7 +108,7 @@ def places_of(
     else:
         found = places_in_hull(cameras, voxels)
         found = found[is_free_at(grid, found)]
-    if len(found) < _FEWEST:
+    if (with_cameras and center is None) or len(found) < _FEWEST:
         found = np.concatenate([found, cameras])
     is_walked = is_dense and center is None
     ground = ground_of(grid, voxels, cameras, meter) if is_walked else None

@@ -234,6 +234,7 @@ def audit(
         is_dense=source.is_dense,
         meter=survey.alignment.scale if source.is_metric else None,
         center=center,
+        with_cameras=True,
     )
     standpoints = places.standing[: settings.num_standpoints]
     on_progress("evaluating frames", 0)
