@@ -23,6 +23,7 @@ from r3jax.apps.audit.diagnosis import (
     NOT_KNOWN,
     Demand,
     Diagnosis,
+    Pictures,
     ViewScore,
     demand_of,
     known_rows,
@@ -143,7 +144,7 @@ class Audit:
 
     @property
     def unknown(self) -> str:
-        """Cause reported for pixels without a known surface."""
+        """Cause reported for pixels of pictures without any known surface."""
         return "unseen" if self.source.is_complete else NOT_KNOWN
 
     @property
@@ -167,9 +168,7 @@ class Audit:
     def mean_renderability(self) -> float:
         """Mean over the frames; without a depth camera, over all their known pixels."""
         value = self.renderability
-        if self.source.is_complete:
-            return float(value.mean())
-        weight = np.array([frame.score.coverage for frame in self.frames])
+        weight = np.array([frame.score.judged for frame in self.frames])
         return float(np.nansum(value * weight) / max(weight.sum(), 1e-9))
 
 
@@ -288,25 +287,34 @@ def _evaluated_frames(
 
     The capture's own frames are evaluated on the map without their fold.
     """
-    known = None if source.is_complete else known_rows(seen.state, is_complete=False)
+    taken = survey.alignment.poses(source.poses[survey.chosen])
+
+    def pictures(numbers: np.ndarray) -> Pictures | None:
+        if source.is_complete:
+            return None
+        cameras = [source.camera(index) for index in survey.chosen[numbers].tolist()]
+        return Pictures(known_rows(seen.state, is_complete=False), cameras, taken[numbers])
+
     if path is not None:
         on_progress("evaluating frames", len(path.poses))
         poses = survey.alignment.poses(path.poses)
+        shown = pictures(np.arange(len(survey.chosen)))
         for index, (pose, lens) in enumerate(zip(poses, path.lenses, strict=True)):
             camera = thinned(lens.camera, source.stride)
-            score = view_score(seen.state, camera, pose, config, known)
+            score = view_score(seen.state, camera, pose, config, shown)
             yield EvaluatedFrame(index, f"frame {index + 1}", pose, score)
             step()
         return
     on_progress("evaluating frames", len(survey.chosen))
-    poses = survey.alignment.poses(source.poses[survey.chosen])
     found: dict[int, EvaluatedFrame] = {}
     for fold in range(len(seen.folds)):
         others = seen.without(fold)
+        shown = pictures(np.flatnonzero(seen.fold_of != fold))
         for place in np.flatnonzero(seen.fold_of == fold).tolist():
             index = int(survey.chosen[place])
-            score = view_score(others, source.camera(index), poses[place], config, known)
-            found[place] = EvaluatedFrame(index, source.labels[index], poses[place], score)
+            depth = None if shown is None else survey.alignment.scale * source.read(index)[1]
+            score = view_score(others, source.camera(index), taken[place], config, shown, depth)
+            found[place] = EvaluatedFrame(index, source.labels[index], taken[place], score)
             step()
     yield from (found[place] for place in sorted(found))
 

@@ -216,7 +216,7 @@ def worst_figure(audit: Audit, count: int = 4) -> Figure:
         style.caption(upper, _short(frame.label))
         lower.set_facecolor("#e5e7eb")
         lower.imshow(value, cmap=style.SCORE_MAP, vmin=0.0, vmax=1.0)
-        beside = "" if audit.source.is_complete else f", {100 * frame.score.coverage:.0f} % known"
+        beside = "" if audit.source.is_complete else f", {100 * frame.score.judged:.0f} % known"
         said = f"R {frame.score.renderability:.2f}, {frame.score.cause}{beside}"
         style.caption(lower, said, style.INK)
     return figure

@@ -225,12 +225,15 @@ def _causes(audit: Audit) -> list[dict[str, Any]]:
     for cause, meaning in sentences.MEANING.items():
         if cause == NOT_KNOWN and is_complete:
             continue
-        is_edge = cause == "unseen"  # the edge of free space, which has an area but no share
+        # The edge of free space has an area but no share.
+        is_edge = cause == "unseen" and is_complete
         if is_edge and not audit.unseen:
             continue
         share = None if is_edge else sentences.cause_share(audit, cause)
         covers = audit.unseen_area if share is None else share * whole
         name, remedy = cause.replace("_", " "), sentences.REMEDY[cause]
+        if not is_complete:
+            meaning = sentences.OF_PIXELS.get(cause, meaning)
         row = {"cause": cause, "name": name, "meaning": meaning, "remedy": remedy}
         if cause == "noise" and not audit.source.has_images:
             rows.append(row | {"share": "not known", "width": None, "about": ""})

@@ -9,14 +9,20 @@ Shape symbols: N rows of the map; p standpoints.
 """
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from scipy import ndimage
 
+from r3jax.captures.alignment import evenly_spaced
+from r3jax.captures.source import projected
+from r3jax.captures.survey import RANGE
 from r3jax.geometry.cameras import Camera
 from r3jax.geometry.selection import for_selected
 from r3jax.mapping.seen import visible_rows
@@ -40,7 +46,7 @@ class ViewScore:
 
     renderability: float
     """Mean over all pixels, where a pixel without a voxel counts 0. If surfaces may be unknown, the
-    mean over the pixels that show a known one; NaN if there are none."""
+    mean over the pixels that are known to be good, bad or unseen; NaN if there are none."""
 
     coverage: float
     """Share of the pixels that show a known voxel."""
@@ -59,7 +65,13 @@ class ViewScore:
     `not_known` if no pixel shows a known surface."""
 
     shares: dict[str, float]
-    """Share of all pixels with each of `CAUSES`, and `unseen` or `not_known`; they sum to 1."""
+    """Share of all pixels with each of `CAUSES`, `unseen` and, if surfaces may be unknown,
+    `not_known`; they sum to 1."""
+
+    @property
+    def judged(self) -> float:
+        """Share of the pixels that are known: all but `not_known`."""
+        return 1.0 - self.shares.get(NOT_KNOWN, 0.0)
 
 
 CAUSE_OF_TERM = {"bias": "angle", "noise": "noise", "resolution": "distance"}
@@ -67,7 +79,8 @@ CAUSE_OF_TERM = {"bias": "angle", "noise": "noise", "resolution": "distance"}
 
 
 NOT_KNOWN = "not_known"
-"""Cause of pixels without a known surface, in captures without a depth camera."""
+"""Cause of pixels without a known surface that pictures may show, in captures without a depth
+camera."""
 
 FEWEST_PICTURES = 2
 """Minimum number of pictures that must measure a voxel for it to count as known, if depth is
@@ -84,12 +97,26 @@ def known_rows(state: MapState, is_complete: bool) -> np.ndarray:
     return np.asarray(state.count) >= (1 if is_complete else FEWEST_PICTURES)
 
 
+class Pictures(NamedTuple):
+    """The pictures of a map that may have unknown surfaces."""
+
+    known: np.ndarray
+    """Mask of the map's rows that are known surfaces, [N]."""
+
+    cameras: Sequence[Camera]
+    """Of each picture, n of them."""
+
+    poses: np.ndarray
+    """`T_world_camera`, [n, 4, 4] [audit units]."""
+
+
 def view_score(
     state: MapState,
     camera: Camera,
     pose: np.ndarray,
     config: ScoringConfig,
-    known: np.ndarray | None = None,
+    pictures: Pictures | None = None,
+    depth: np.ndarray | None = None,
 ) -> ViewScore:
     """Evaluates one view.
 
@@ -98,15 +125,24 @@ def view_score(
         camera: camera of the view, with its focal length in the unit used for the map.
         pose: `T_world_camera`, [4, 4] [audit units].
         config: range and size of the depth buffer.
-        known: mask of known surfaces, [N]: pixels without one are not known. None if all rows are
-            known; pixels without a voxel are then unseen.
+        pictures: what the map was made of, if surfaces may be unknown: a pixel without a known one
+            is unseen if no picture can show what is there, or if it is beyond the range; else it is
+            not known. None: all rows are known, and pixels without a voxel are unseen.
+        depth: z-depth of the view's own picture, if it has one, [H, W] [audit units]; 0: not known.
     """
     seen = term_images(state, camera, jnp.asarray(pose, dtype=jnp.float32), config)
     row, value = np.asarray(seen.row), np.asarray(seen.value)
     is_hit = row < state.capacity
-    if known is not None:
-        is_hit &= known[np.where(is_hit, row, 0)]
+    if pictures is not None:
+        is_hit &= pictures.known[np.where(is_hit, row, 0)]
     coverage = float(is_hit.mean())
+    unseen = 1.0 - coverage
+    if pictures is not None:
+        if depth is None or not (depth > 0.0).any():
+            center = np.asarray(state.center, np.float64).T
+            depth = np.zeros(is_hit.shape)
+            depth[is_hit] = (center[row[is_hit]] - pose[:3, 3]) @ pose[:3, 2]
+        unseen *= _shown_by_none(depth, is_hit, camera, pose, pictures)
     images = {name: np.asarray(getattr(seen, name))[is_hit] for name in TERMS}
     mean = {name: float(x.mean()) if x.size else 0.0 for name, x in images.items()}
     # log R is the sum of the terms' logarithms, so the cost of each term adds up over the pixels.
@@ -117,13 +153,12 @@ def view_score(
     }
     count = np.asarray(state.count)[np.asarray(seen.row)[is_hit]]
     pixels = np.bincount(cause_of(value[is_hit], costs, count), minlength=len(CAUSES))
-    if known is None:
-        cost["unseen"] = (1.0 - coverage) * -np.log(LEAST)
-        mean_value = float(np.where(is_hit, value, 0.0).mean())
-    else:
-        if not is_hit.any():
-            cost = {NOT_KNOWN: 0.0}
-        mean_value = float(value[is_hit].mean()) if is_hit.any() else float("nan")
+    cost["unseen"] = unseen * -np.log(LEAST)
+    judged = coverage + unseen
+    if judged <= 0.0:
+        cost = {NOT_KNOWN: 0.0}
+    mean_value = float(value[is_hit].sum()) / is_hit.size / judged if judged else float("nan")
+    known = {} if pictures is None else {NOT_KNOWN: 1.0 - judged}
     return ViewScore(
         renderability=mean_value,
         coverage=coverage,
@@ -133,9 +168,49 @@ def view_score(
         cause=max(cost, key=lambda name: cost[name]),
         shares={
             **dict(zip(CAUSES, (pixels / is_hit.size).tolist(), strict=True)),
-            "unseen" if known is None else NOT_KNOWN: 1.0 - coverage,
+            "unseen": unseen,
+            **known,
         },
     )
+
+
+_PROBES = 400
+"""Maximum number of pixels of a view that are looked for in other pictures."""
+
+
+def _shown_by_none(
+    depth: np.ndarray, is_hit: np.ndarray, camera: Camera, pose: np.ndarray, pictures: Pictures
+) -> float:
+    """Estimates which share of a view's pixels without a surface no picture can show.
+
+    What is there is taken to be as far as the nearest pixel of known depth. Beyond the range, or
+    where it is in the field of view of no picture within the range, no picture shows it.
+
+    Args:
+        depth: z-depth of the view, of any resolution, [H, W] [audit units]; 0: not known.
+        is_hit: pixels that show a surface, [h, w].
+        camera: of the view.
+        pose: `T_world_camera`, [4, 4] [audit units].
+        pictures: the pictures.
+    """
+    is_known = depth > 0.0
+    if not is_known.any() or is_hit.all():
+        return 0.0
+    row, column = np.nonzero(~is_hit)
+    some = evenly_spaced(len(row), _PROBES)
+    across, down = (column[some] + 0.5) / is_hit.shape[1], (row[some] + 0.5) / is_hit.shape[0]
+    u, v = across * camera.width, down * camera.height
+    nearest = ndimage.distance_transform_edt(~is_known, return_distances=False, return_indices=True)
+    assert nearest is not None
+    at = (down * depth.shape[0]).astype(int), (across * depth.shape[1]).astype(int)
+    z = depth[nearest[0][at], nearest[1][at]].astype(np.float64)
+    x, y = (u - float(camera.cx)) / float(camera.fx), (v - float(camera.cy)) / float(camera.fy)
+    points = (z * np.stack([x, y, np.ones_like(x)])).T @ pose[:3, :3].T + pose[:3, 3]
+    is_shown = np.zeros(len(points), dtype=bool)
+    for other, at in zip(pictures.cameras, pictures.poses, strict=True):
+        place = projected(other, at, points)
+        is_shown |= place.is_in & (place.z <= RANGE)
+    return float(1.0 - (is_shown & (z <= RANGE)).mean())
 
 
 CAUSES = ("fine", "angle", "rare", "distance", "noise")

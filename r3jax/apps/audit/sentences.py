@@ -23,6 +23,12 @@ MEANING = {
 }
 """Meaning of each cause, for the table."""
 
+OF_PIXELS = {
+    "fine": f"the other pictures show it well enough: R ≥ {FINE:g}",
+    "unseen": "no other picture shows it, as far as the surfaces around it tell",
+}
+"""Meaning of causes without a depth camera, where they are shares of the pictures' pixels."""
+
 REMEDY = {
     "fine": "",
     "angle": "take pictures from the missing sides",
@@ -199,6 +205,9 @@ def _surfaces(audit: Audit) -> str:
             f"There is no depth camera: depth comes from {_DEPTH_FROM[audit.source.kind]}. "
             f"{fine} of the pixels of the {what}"
         )
+        if audit.shares["unseen"] >= 0.005:
+            by = "no other picture" if audit.is_own_path else "no picture"
+            parts.append(f"{100 * audit.shares['unseen']:.0f} % is shown by {by}")
         parts.append(f"{_unknown(audit)} is not known ({MEANING[NOT_KNOWN]})")
     well = f"R ≥ {FINE:g}" + ("" if audit.source.has_images else ", if colors agree")
     return f"{start} is seen well enough ({well})" + (f"; {listed(parts)}." if parts else ".")
@@ -364,7 +373,8 @@ def method(audit: Audit) -> list[str]:
     pixels = (
         "; pixels without a voxel count as 0"
         if source.is_complete
-        else " with a known surface (a voxel measured by at least two pictures)"
+        else " with a known surface (a voxel measured by at least two pictures) and those that "
+        "no picture used can show, which count as 0"
     )
     if audit.is_own_path:
         count = len(audit.seen.folds)
@@ -379,8 +389,8 @@ def method(audit: Audit) -> list[str]:
             f"mean over its pixels{pixels}."
         )
     where = (
-        f"in free space, {length(audit, 0.3)} from everything else, connected to the camera's "
-        "positions and at its heights"
+        f"where a camera was, or in free space, {length(audit, 0.3)} from everything else, "
+        "connected to the camera's positions and at its heights"
         if source.is_dense
         else f"up to {length(audit, 0.3)} outside the hull of the camera's positions, "
         f"{length(audit, 0.3)} from every voxel, where a camera was or a ray to a point passed"
@@ -480,7 +490,7 @@ def advice(audit: Audit) -> list[tuple[str, str]]:
     ]
     found += _about_surfaces(audit)
     if not audit.source.is_complete and audit.shares[NOT_KNOWN] >= _LEAST_TOLD:
-        unknown = f"{_unknown(audit)} is not known: {MEANING[NOT_KNOWN]}."
+        unknown = f"{_unknown(audit)} is not known ({MEANING[NOT_KNOWN]})."
         found.append((audit.shares[NOT_KNOWN], "Let pictures overlap more", unknown))
     if audit.unseen:
         whole = float(audit.diagnosis.is_seen.sum()) * survey.voxel_size**2

@@ -13,6 +13,7 @@ from r3jax.apps.audit.diagnosis import (
     CAUSES,
     FINE,
     NOT_KNOWN,
+    Pictures,
     cause_of,
     known_rows,
     view_score,
@@ -29,7 +30,7 @@ from r3jax.apps.audit.settings import AuditSettings
 from r3jax.captures import capture_maps
 from r3jax.captures.camera_paths import CameraPath
 from r3jax.captures.source import Source, source_of
-from r3jax.captures.survey import MARGIN, survey_of
+from r3jax.captures.survey import MARGIN, RANGE, survey_of
 from r3jax.captures.vertical import Vertical
 from r3jax.formats.colmap.reader import read_colmap
 from r3jax.formats.errors import FormatError
@@ -276,7 +277,7 @@ def test_tracks_of_a_model_are_as_good_as_a_cloud(folder, cloud):
 def test_without_depth_images_what_no_point_shows_is_not_known(cloud, corner):
     """One measure for the headline and the frames: nothing is fine that no pixel shows."""
     shares = cloud.shares
-    assert shares.keys() == {*CAUSES, NOT_KNOWN}
+    assert shares.keys() == {*CAUSES, "unseen", NOT_KNOWN}
     assert 0.0 < shares[NOT_KNOWN] < 1.0
     said = " ".join(verdict(cloud))
     assert re.search(rf"\b{100 * shares['fine']:.0f}\s% of the pixels", said)
@@ -304,8 +305,9 @@ def test_no_two_numbers_of_an_audit_contradict_each_other(name, request):
         assert path["mean"] == pytest.approx(np.mean(of_pixels))
         return
     assert surfaces["share"] == path["share"]
-    np.testing.assert_allclose([s["shares"][NOT_KNOWN] for s in scores], 1.0 - covered, atol=1e-6)
-    assert path["mean"] == pytest.approx(np.average(of_pixels, weights=covered))
+    judged = covered + [s["shares"]["unseen"] for s in scores]
+    np.testing.assert_allclose([s["shares"][NOT_KNOWN] for s in scores], 1.0 - judged, atol=1e-6)
+    assert path["mean"] == pytest.approx(np.average(of_pixels, weights=judged))
     # What is fine has R of FINE or more, and the rest has less: the mean lies between.
     fine = path["share"]["fine"] / (1.0 - path["share"][NOT_KNOWN])
     assert fine * FINE <= path["mean"] <= fine + (1.0 - fine) * FINE
@@ -315,7 +317,8 @@ def test_a_frame_of_which_nothing_is_known_has_no_number(cloud):
     away = np.eye(4)
     away[:3, 3] = 100.0
     known = known_rows(cloud.seen.state, is_complete=False)
-    score = view_score(cloud.seen.state, cloud.camera, away, cloud.config, known)
+    pictures = Pictures(known, [cloud.camera], away[None])
+    score = view_score(cloud.seen.state, cloud.camera, away, cloud.config, pictures)
     assert (score.cause, score.coverage) == (NOT_KNOWN, 0.0)
     assert np.isnan(score.renderability)
     blank = replace(cloud.frames[0], score=score)
@@ -323,6 +326,26 @@ def test_a_frame_of_which_nothing_is_known_has_no_number(cloud):
     assert record_of(found)["path"]["frames"][0]["renderability"] is None
     assert "nan" not in " ".join(verdict(found))
     json.dumps(record_of(found), allow_nan=False)
+
+
+def test_pixels_that_no_picture_can_show_are_unseen_and_count_0(cloud):
+    known, pose = known_rows(cloud.seen.state, is_complete=False), cloud.frames[0].pose
+    by = lambda poses, depth=None: view_score(
+        cloud.seen.state,
+        cloud.camera,
+        pose,
+        cloud.config,
+        Pictures(known, [cloud.camera] * len(poses), np.reshape(poses, (-1, 4, 4))),
+        depth,
+    )
+    alone, shown = by([]), by([pose])
+    assert by([pose], np.full((4, 3), 1.1 * RANGE)).shares == pytest.approx(alone.shares)
+    assert 0.0 < alone.coverage < 1.0
+    assert alone.shares["unseen"] == pytest.approx(1.0 - alone.coverage)
+    assert (alone.shares[NOT_KNOWN], shown.shares["unseen"]) == (0.0, 0.0)
+    assert alone.renderability == pytest.approx(shown.renderability * alone.coverage)
+    for score in (alone, shown):
+        assert sum(score.shares.values()) == pytest.approx(1.0)
 
 
 def test_pictures_without_a_point_are_not_known_either(cloud):
@@ -381,7 +404,7 @@ def test_everything_written_is_in_the_captures_coordinates(cloud, tmp_path):
         assert np.median(off) < 0.6 * cloud.survey.length(cloud.survey.voxel_size)
     record = record_of(cloud)
     assert len(record["path"]["frames"]) == 16
-    assert record["surfaces"]["share"].keys() == {*CAUSES, NOT_KNOWN}
+    assert record["surfaces"]["share"].keys() == {*CAUSES, "unseen", NOT_KNOWN}
     assert record["up"] == [0.0, 0.0, 1.0]
 
 
