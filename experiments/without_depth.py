@@ -1,22 +1,33 @@
 """Compares audits of photos alone with audits of the same photos and a depth camera.
 
-    python -m experiments.without_depth ../shared/recordings/hololens_lounge --out /tmp/without
+    python -m experiments.hand_walks flat --out walk-flat --frames 120 --width 480
+    python -m experiments.without_depth hololens_lounge walk-flat --out without_depth
 
 Of each capture with depth its photos are matched and triangulated at its poses by pycolmap, which
 gives what a structure from motion would; its depth is used for comparison only. Then it is audited
-from its depth, from sparse points, from depth swept from the photos, and from trained splats
-(`--models`, one for each). Regions are blocks of 0.5 in the unit of the capture; of each the
-mean R over its surfaces is compared by a rank correlation (Spearman), over the regions that both
-know. An interval is that of 1,000 resamplings of the regions.
+from its depth, from sparse points, from depth swept from the photos, and from a splat that was
+trained on the photos and begun at the sparse points. All settings are those of `r3jax audit`.
+
+Regions are blocks of 0.5 in the unit of the capture; of each the mean R over its surfaces is
+compared by a rank correlation (Spearman), over the regions that both know; and once more with both
+audits judging from the places that the one without depth chose. An interval is that of 1,000
+resamplings of regions, or of frames. The views that an audit suggests are simulated on the map with
+depth: how much they raise the mean R of its surfaces, as a share of what the views do that were
+chosen with depth.
+
+Each comparison is a file in `--out`; what is there is not done again.
 """
 
 import json
 import shutil
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
 
+import jax.numpy as jnp
 import numpy as np
 import tyro
 from PIL import Image
@@ -24,15 +35,22 @@ from scipy.spatial import KDTree
 from scipy.stats import spearmanr
 
 from r3jax.apps.audit.audit import Audit, audit
+from r3jax.apps.audit.diagnosis import Diagnosis, demand_of, known_rows
 from r3jax.apps.audit.settings import AuditSettings
+from r3jax.apps.audit.suggest import Task
+from r3jax.captures.alignment import Alignment
 from r3jax.captures.settings import Surfaces
 from r3jax.captures.source import Source, source_of
-from r3jax.captures.survey import RANGE
 from r3jax.formats.captures import open_capture
 from r3jax.formats.colmap.binary import write_binary
 from r3jax.formats.colmap.model import ColmapImage, ColmapModel, colmap_pose, points_without_tracks
 from r3jax.formats.colmap.reader import read_colmap
 from r3jax.formats.lenses import pinhole_lens
+from r3jax.scoring.simulated import simulate_view
+from r3jax.splatting.ply import write_scene
+from r3jax.splatting.training.config import TrainConfig
+from r3jax.splatting.training.train import fit
+from r3jax.splatting.views import load_views
 
 BLOCK = 0.5
 """Edge of a region [capture units]."""
@@ -45,8 +63,11 @@ _FEATURES = 4000
 
 _SAMPLES = 1000
 
-_SPARSE_VOXEL = 0.1
-"""Edge of a voxel of sparse points [capture units]: with finer ones walls have gaps."""
+_SPLAT = TrainConfig(iterations=4000, capacity=60_000)
+"""Training of the splats."""
+
+_SPLAT_SIDE = 270
+"""Longer side of the images that they are trained on [px]."""
 
 
 @dataclass(frozen=True)
@@ -59,14 +80,8 @@ class Options:
     out: Path = Path("without_depth")
     """Folder of the photos, their models and the results."""
 
-    models: tuple[Path, ...] = ()
-    """A trained splat for each capture."""
-
-    surfaces: tuple[Surfaces, ...] = ("points", "sweep")
+    surfaces: tuple[Surfaces, ...] = ("sweep", "points", "model")
     """Sources of surfaces that are compared with depth."""
-
-    views: int = 0
-    """Views to suggest, whose overlap is compared."""
 
 
 def photos_alone(source: Source, folder: Path) -> Path:
@@ -122,16 +137,25 @@ def photos_alone(source: Source, folder: Path) -> Path:
     return folder
 
 
-def voxels(found: Audit) -> tuple[np.ndarray, np.ndarray]:
+def splat_alone(photos: Source, path: Path) -> Path:
+    """Trains a splat on photos, begun at their sparse points, and writes it as a PLY."""
+    if not path.exists():
+        as_it_is = Alignment(np.eye(3), 1.0, np.zeros(3))
+        frames = (photos.frame(index, as_it_is) for index in range(len(photos)))
+        found = fit(load_views(frames, _SPLAT_SIDE), _SPLAT)
+        write_scene(path, found.scene)
+    return path
+
+
+def voxels(found: Audit, diagnosis: Diagnosis) -> tuple[np.ndarray, np.ndarray]:
     """Centers [m, 3] and R [m] of the surfaces that were judged, in the capture's coordinates."""
-    judged = found.diagnosis.is_seen
-    centers = np.asarray(found.seen.state.center, np.float64).T[judged]
-    return found.survey.alignment.points_back(centers), found.diagnosis.value[judged]
+    centers = np.asarray(found.seen.state.center, np.float64).T[diagnosis.is_seen]
+    return found.survey.alignment.points_back(centers), diagnosis.value[diagnosis.is_seen]
 
 
-def regions(found: Audit) -> dict[tuple[int, ...], float]:
+def regions(found: Audit, diagnosis: Diagnosis) -> dict[tuple[int, ...], float]:
     """Mean R of every block that has enough surfaces."""
-    centers, value = voxels(found)
+    centers, value = voxels(found, diagnosis)
     block, index = np.unique(np.floor(centers / BLOCK).astype(int), axis=0, return_inverse=True)
     index = index.reshape(-1)
     count = np.bincount(index)
@@ -158,70 +182,107 @@ def _spearman(a: np.ndarray, b: np.ndarray) -> float:
     return float(found.statistic)
 
 
+def raised(truth: Audit, poses: np.ndarray) -> float:
+    """Simulates views on the map with depth, and returns by how much they raise its mean R.
+
+    Args:
+        truth: the audit with depth.
+        poses: of the views, [n, 4, 4] in the capture's coordinates.
+    """
+    state = truth.seen.state
+    task = Task(truth.camera, demand_of(state, truth.standpoints, truth.config), truth.config)
+    for pose in truth.survey.alignment.poses(poses):
+        T = jnp.asarray(pose, dtype=jnp.float32)
+        state, _ = simulate_view(state, truth.camera, T, truth.config)
+    return task.evaluate(state)[1].mean - truth.diagnosis.mean
+
+
+def suggested(found: Audit) -> np.ndarray:
+    """Returns the suggested views in the capture's coordinates, [n, 4, 4]."""
+    poses = np.reshape([view.pose for view in found.plan.views], (-1, 4, 4))
+    return found.survey.alignment.poses_back(poses)
+
+
+def from_places_of(truth: Audit, found: Audit) -> Diagnosis:
+    """Diagnoses the map with depth from the standpoints of another audit."""
+    places = found.survey.alignment.points_back(found.standpoints)
+    demand = demand_of(truth.seen.state, truth.survey.alignment.points(places), truth.config)
+    return Task(truth.camera, demand, truth.config).evaluate(truth.seen.state)[1]
+
+
 def compare(truth: Audit, found: Audit) -> dict[str, Any]:
     """How an audit without depth compares with that from depth."""
-    there, here = regions(truth), regions(found)
+    there, here = regions(truth, truth.diagnosis), regions(found, found.diagnosis)
     both = sorted(there.keys() & here.keys())
     of_regions = ranks(np.array([there[k] for k in both]), np.array([here[k] for k in both]))
-    real = {frame.index: frame.score.renderability for frame in truth.frames}
-    pairs = [
-        (real[f.index], f.score.renderability)
-        for f in found.frames
-        if f.index in real and np.isfinite(f.score.renderability)
-    ]
-    of_frames = ranks(*np.array(pairs).T)
-    (true, _), (own, _) = voxels(truth), voxels(found)
+    same = regions(truth, from_places_of(truth, found))
+    shared = sorted(same.keys() & here.keys())
+    of_same = ranks(np.array([same[k] for k in shared]), np.array([here[k] for k in shared]))
+    real = {frame.index: frame.score for frame in truth.frames}
+    pairs = [(real[f.index], f.score) for f in found.frames if f.index in real and f.score.judged]
+    of_frames = ranks(*np.array([(a.renderability, b.renderability) for a, b in pairs]).T)
+    (true, _), (own, _) = voxels(truth, truth.diagnosis), voxels(found, found.diagnosis)
     to_true, _ = KDTree(true).query(own)
     to_own, _ = KDTree(own).query(true)
+    best = raised(truth, suggested(truth))
     return {
         "regions_compared": len(both),
         "regions_with_depth": len(there),
         "spearman_regions": of_regions,
+        "spearman_regions_from_same_places": of_same,
+        "frames_compared": len(pairs),
         "spearman_frames": of_frames,
         "not_known": found.shares[found.unknown],
+        "unseen": found.shares["unseen"],
+        "unseen_with_depth": truth.shares["unseen"],
         "within_10_cm_of_depth": float((to_true < 0.1).mean()),
         "surface_known": float((to_own < 0.1).mean()),
+        "views_raise": raised(truth, suggested(found)) / best if best > 0.0 else None,
+        "random_views_raise": (truth.plan.random_mean[-1] - truth.diagnosis.mean) / best,
+        "best_views_raise_mean_r_by": best,
         "mean_r_of_regions": float(np.mean([here[k] for k in both])),
         "mean_r_of_regions_with_depth": float(np.mean([there[k] for k in both])),
-        "mean_r": found.diagnosis.mean,
-        "mean_r_with_depth": truth.diagnosis.mean,
+        "range": found.survey.length(5.0),
+        "range_with_depth": truth.survey.length(5.0),
+        "voxel": found.survey.length(found.survey.voxel_size),
+        "standpoints": len(found.standpoints),
+        "known_rows": int(known_rows(found.seen.state, found.source.is_complete).sum()),
         "voxels": len(own),
         "voxels_with_depth": len(true),
     }
+
+
+def compare_capture(path: Path, out: Path, surfaces: tuple[Surfaces, ...]) -> list[dict[str, Any]]:
+    """Makes the comparisons of a capture that are not there, and returns all of them."""
+    capture = open_capture(path, "z")
+    source = source_of(capture.source, capture.name)
+    folder = out / path.name
+    photos = photos_alone(source, folder / "photos")
+    truth: Callable[[], Audit] = lru_cache(lambda: audit(source))
+    rows: list[dict[str, Any]] = []
+    for name in surfaces:
+        cell = folder / f"{name}.json"
+        if not cell.exists():
+            bare = source_of(read_colmap(photos), capture.name)
+            model = splat_alone(bare, folder / "splat.ply") if name == "model" else None
+            settings = AuditSettings(surfaces=name, model=model)
+            known = truth()
+            begun = time.perf_counter()
+            found = audit(bare, settings)
+            row = {"capture": path.name, "surfaces": name, "pictures": len(bare)}
+            row |= {"seconds": time.perf_counter() - begun, **compare(known, found)}
+            cell.write_text(json.dumps(row, indent=1) + "\n")
+        rows.append(json.loads(cell.read_text()))
+        print(json.dumps(rows[-1], indent=1), flush=True)
+    return rows
 
 
 def main(options: Options) -> None:
     """Compares, and writes `results.json`."""
     options.out.mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, Any]] = []
-    for number, path in enumerate(options.captures):
-        capture = open_capture(path, "z")
-        source = source_of(capture.source, capture.name)
-        photos = photos_alone(source, options.out / capture.name)
-        truth = audit(source, AuditSettings(views=options.views))
-        # The same vertical: what is compared is surfaces, not a guess of up.
-        up = ",".join(f"{value:.9f}" for value in truth.survey.up.direction)
-        wanted: list[tuple[Surfaces, Path | None]] = [(name, None) for name in options.surfaces]
-        if number < len(options.models):
-            wanted.append(("model", options.models[number]))
-        for name, model in wanted:
-            bare = source_of(read_colmap(photos), capture.name)
-            voxel = _SPARSE_VOXEL if name == "points" else None
-            settings = AuditSettings(
-                views=options.views,
-                up=up,
-                surfaces="auto" if name == "model" else name,
-                model=model,
-                max_range=RANGE * truth.survey.length(1.0),
-                voxel_size=voxel or truth.survey.length(truth.survey.voxel_size),
-            )
-            begun = time.perf_counter()
-            found = audit(bare, settings)
-            row = {"capture": capture.name, "surfaces": name, **compare(truth, found)}
-            row["seconds"] = time.perf_counter() - begun
-            row["pictures"] = len(bare)
-            print(json.dumps(row, indent=1), flush=True)
-            rows.append(row)
+    for path in options.captures:
+        rows += compare_capture(path, options.out, options.surfaces)
     (options.out / "results.json").write_text(json.dumps(rows, indent=1) + "\n")
 
 
