@@ -186,15 +186,15 @@ def _check_model(
     covered = float(np.mean([(depth > 0.0).mean() for depth in depths]))
     if covered < _COVERED:
         raise InputError(f"{what}it covers {100 * covered:.0f} % of its pictures{todo}")
-    if not source.is_dense:
-        off: list[np.ndarray] = []
-        for index in evenly_spaced(len(source), _COMPARED).tolist():
-            off.append(_off(depths[index], thin, index, points_shown(source, index)))
-        ratio = 1.0 + np.concatenate(off)
-        if len(ratio) and np.median(np.abs(ratio - 1.0)) > _MISFIT:
-            raise InputError(
-                f"{what}its surfaces are {np.median(ratio):.2g} times as far as the points{todo}"
-            )
+    off: list[np.ndarray] = []
+    for index in evenly_spaced(len(source), _COMPARED).tolist():
+        off.append(_off(depths[index], thin, index, points_shown(source, index)))
+    ratio = 1.0 + np.concatenate(off)
+    if len(ratio) and np.median(np.abs(ratio - 1.0)) > _MISFIT:
+        than = "the depth images say" if source.is_dense else "the points"
+        raise InputError(
+            f"{what}its surfaces are {np.median(ratio):.2g} times as far as {than}{todo}"
+        )
     if alike and np.median(alike) < _ALIKE:
         raise InputError(
             f"{what}its renderings correlate with the pictures by only {np.median(alike):.2f}{todo}"
@@ -237,7 +237,7 @@ def swept(source: Source, on_progress: Progress = lambda stage, steps: None) -> 
 
 
 def points_shown(source: Source, index: int) -> np.ndarray:
-    """Lists the sparse points visible in an image, [k, 3] in the capture's coordinates."""
+    """Lists the points visible in an image, [k, 3] in the capture's coordinates."""
     _, depth = source.read(index)
     camera, pose = source.camera(index), source.poses[index]
     row, column = np.nonzero((depth > 0.0) & np.isfinite(depth))

@@ -2,13 +2,26 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from r3jax.captures import surfaces
 from r3jax.captures.source import source_of
 from r3jax.captures.surfaces import with_surfaces
+from r3jax.errors import InputError
 from r3jax.formats.captures import open_capture
-from tests.apps.audit.room import HEIGHT, WIDTH, picture, round_poses, write_colmap
+from r3jax.kernels.constants import SH0
+from r3jax.splatting.ply import write_scene
+from r3jax.splatting.scene import GaussianScene
+from tests.apps.audit.room import (
+    HEIGHT,
+    WIDTH,
+    picture,
+    round_poses,
+    wall_points,
+    write_colmap,
+)
 
 
 def test_pixels_that_masks_hide_need_no_depth(tmp_path, monkeypatch):
@@ -27,3 +40,55 @@ def test_pixels_that_masks_hide_need_no_depth(tmp_path, monkeypatch):
         return rgb, gray * is_shown
 
     assert with_surfaces(dataclasses.replace(source, photograph=masked)).kind == "sweep"
+
+
+MIDDLE = np.array([2.0, 1.5, 1.2])
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("room")
+    return source_of(open_capture(write_colmap(folder, round_poses(20))).source, "room")
+
+
+def wall_splat(path, *, scale=1.0, shift=0.0, inverted=False):
+    """A PLY of the room's walls: a round Gaussian at each point of them."""
+    points, colors = wall_points()
+    color = colors / np.float32(255.0)
+    count = len(points)
+    scene = GaussianScene(
+        means=jnp.asarray(MIDDLE + scale * (points - MIDDLE) + shift, jnp.float32),
+        quats=jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (count, 1)),
+        log_scales=jnp.full((count, 3), np.log(0.06 * scale), jnp.float32),
+        opacity_logits=jnp.full(count, 4.0),
+        sh=jnp.asarray(((1.0 - color if inverted else color) - 0.5) / SH0, jnp.float32)[:, None],
+    )
+    write_scene(path, scene)
+    return path
+
+
+@pytest.mark.full
+def test_a_splat_gives_the_depth_of_its_surfaces(room, tmp_path):
+    found = with_surfaces(room, model=wall_splat(tmp_path / "scene.ply"))
+    assert found.kind == "model"
+    for index, pose in enumerate(round_poses(20)):
+        depth = found.read(index)[1]
+        is_known = depth > 0.0
+        assert is_known.mean() > 0.3
+        off = depth[is_known] / picture(pose)[1][is_known] - 1.0
+        assert np.median(np.abs(off)) < 0.06
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"scale": 2.0}, r"\b(1\.[5-9]|2|2\.[0-5]) times as far"),
+        ({"shift": 100.0}, r"covers 0 %"),
+        ({"inverted": True}, r"only -\d\.\d\d"),
+    ],
+)
+def test_a_splat_of_another_place_or_scale_is_refused_with_the_difference(
+    room, tmp_path, wrong, said
+):
+    with pytest.raises(InputError, match=said):
+        with_surfaces(room, model=wall_splat(tmp_path / "scene.ply", **wrong))
