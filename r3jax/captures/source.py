@@ -281,7 +281,7 @@ class Source:
             return among[evenly_spaced(len(among), most)]
         photos, counts = np.unique(self.photo_of[among], return_counts=True)
         chosen = photos[evenly_spaced(len(photos), max(1, most // int(counts.max())))]
-        return among[np.isin(self.photo_of[among], chosen)]
+        return among[np.isin(self.photo_of[among], chosen)][:most]
 
     def camera(self, index: int) -> Camera:
         """Returns the pinhole of a thinned image."""
@@ -383,6 +383,8 @@ def _of_images(images: PosedImages, name: str) -> Source:
             f"None of the {len(images)} pictures was found (the first should be "
             f"{images.image_paths[0]}): their sharpness, exposure and colors are not known."
         )
+        if images.image_paths[0].parent.is_file():  # git without symbolic links
+            none += f" {images.image_paths[0].parent} is a file: restore the folder it stands for."
         remark = none if remark is None else f"{none} {remark}"
     if hidden := _hidden_share(images) if has_images else 0.0:
         masked = f"Masks hide {100 * hidden:.0f} % of the pictures."

@@ -155,7 +155,7 @@ def shown_faces(lens: Lens, cut: Cut) -> tuple[str, ...]:
     """Lists the faces of which a photo shows enough."""
     coarse = 64.0 / view_lens(lens, cut).width
     return tuple(
-        face for face in FACES if _table(lens, face, cut, coarse)[1].mean() >= _LEAST_SHOWN
+        face for face in FACES if _table_of(lens, face, cut, coarse)[1].mean() >= _LEAST_SHOWN
     )
 
 
@@ -190,8 +190,13 @@ def _rays(lens: Lens, scale: float) -> np.ndarray:
     return np.stack([x, y, np.ones_like(x)], axis=-1)
 
 
-@functools.lru_cache(maxsize=len(FACES))
-def _table(lens: Lens, face: str, cut: Cut, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+@functools.lru_cache(maxsize=2 * len(FACES))
+def _table(lens: Lens, face: str, cut: Cut) -> tuple[np.ndarray, np.ndarray]:
+    """Keeps the tables of two lenses."""
+    return _table_of(lens, face, cut, 1.0)
+
+
+def _table_of(lens: Lens, face: str, cut: Cut, scale: float) -> tuple[np.ndarray, np.ndarray]:
     """Computes which pixel of the photo a view's pixel takes [s, s] int32, and whether it may."""
     rays = _rays(view_lens(lens, cut), scale) @ FACES[face].T
     column, row = project_rays(lens, rays)
