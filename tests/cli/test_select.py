@@ -216,7 +216,7 @@ def test_targets_may_be_where_people_could_stand(captures, tmp_path):
     assert record["targets"] == "stand"
     assert record["num_targets"] % 8 == 0  # level directions of each place
     assert len(record["kept"]) == 4
-    assert np.all(np.diff(record["objective"]) >= -1e-6)
+    assert np.all(np.diff(record["renderability"]) >= -1e-6)
 
 
 def test_ctrl_c_writes_the_frames_chosen_so_far(captures, tmp_path, monkeypatch):

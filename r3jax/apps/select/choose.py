@@ -1,4 +1,4 @@
-"""Chooses frames one after another, each by its gain in the targets' renderability.
+"""Chooses frames one after another, each by its gain in the objective (`objective`).
 
 Lazy greedy: R is not submodular (a direction that closes kappa's box is more useful after its
 counterpart), so that an old gain is not an exact bound. `is_exact` evaluates every candidate before
@@ -39,7 +39,7 @@ class Choice:
     """Indices of the frames, [k] int64."""
 
     gain: np.ndarray
-    """Gain of each frame when it was chosen, [k]."""
+    """By how much each frame raised the mean renderability when it was chosen, [k]."""
 
     per_target: np.ndarray
     """Renderability of each target after each frame, [k, T] float32."""
@@ -48,20 +48,20 @@ class Choice:
     """Renderability of each target after all frames, [T]."""
 
     left: np.ndarray
-    """Remaining gain of each frame at the end, [n]; 0 for those chosen."""
+    """By how much each frame would still raise it at the end, [n]; 0 for those chosen."""
 
     is_complete: bool = True
     """False if the selection was interrupted."""
 
     @property
-    def objective(self) -> np.ndarray:
+    def renderability(self) -> np.ndarray:
         """Mean renderability of the targets after each frame, [k]."""
         return self.per_target.mean(axis=1, dtype=np.float64)
 
     @property
     def share(self) -> np.ndarray:
-        """The objective as a share of its value with all frames, [k]."""
-        return self.objective / max(float(self.of_all.mean()), 1e-9)
+        """The mean renderability as a share of that with all frames, [k]."""
+        return self.renderability / max(float(self.of_all.mean()), 1e-9)
 
 
 def tie_ranks(sharpness: np.ndarray, positions: np.ndarray, names: Sequence[str]) -> np.ndarray:
@@ -97,8 +97,8 @@ def choose(
         observed: observations of every frame.
         targets: views whose renderability counts.
         num: maximum number of frames, including those to keep.
-        gain: share of the objective with all allowed frames at which to stop; None to stop at
-            `num`.
+        gain: share of the mean renderability with all allowed frames at which to stop; None to
+            stop at `num`.
         keep: frames that are chosen first, regardless of their gain.
         allowed: False for frames that may not be chosen, [n].
         ranks: tie-breaking ranks, [n], see `tie_ranks`; None: the order of the frames.

@@ -1,16 +1,22 @@
 """Computes the objective, the mean renderability of targets, and the gain of one more frame.
 
-A frame observes rows of the map of all frames: a direction bin, a resolution, a color. For the
+A frame observes rows of the map of all frames: a direction, a resolution, a color. For the
 frames chosen so far a row has a count, a mean color, a spread and a best resolution; a pair of a
 row and a target that shows it has the nearest seen direction and the sides of kappa's box. Each of
 these is updated by another observation in constant time, so that computing a gain is linear in the
 number of observations of the frame.
 
-The value is that of `scoring.terms.score_voxels` on the map of just the frames chosen, times
+A frame shows a row if nothing that it measured hides it, also where none of its pixels fell into
+the voxel: noise and drift spread a surface over several layers of voxels, and a picture shows all
+of them. Rows that count only where a pixel falls would favor the frames with the worst depth.
+
+Directions are those of the cameras themselves, not bins: where a camera moves by little, bins 20
+degrees apart would soon call everything well seen. The value is that of `scoring.terms` for the
+frames chosen, times
 
     s^(delta b),   s the sharpness (1 / blur in pixels) of the sharpest frame that shows the row
 
-(`renderability_of` computes it that way). In R, resolution has the power 1 - delta b: it matters
+In R, resolution has the power 1 - delta b: it matters
 where a view must interpolate, but at the exact place of a frame that frame counts as ground truth.
 A blurred frame is not ground truth. With this factor its blur counts in full from everywhere, until
 a sharp frame shows the same surface. `kernels.scoring.frame_gains` is the same in machine code, and
@@ -19,21 +25,14 @@ tests compare it with these formulas.
 Shape symbols: N rows; P pairs; T targets; n frames; m observations.
 """
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from r3jax.apps.select.observations import Observed
 from r3jax.apps.select.targets import Targets
-from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.kernels.constants import ON_EDGE
 from r3jax.kernels.native.platform import missing_for_machine_code
-from r3jax.mapping.state import MapState
-from r3jax.scoring.terms import score_voxels
 
 _ALL_SIDES = 15
 
@@ -51,8 +50,7 @@ class Objective:
                 available.
         """
         num, pairs = observed.num_rows, len(targets.target)
-        self._observed, self._targets = observed, targets
-        self._lattice = fibonacci_lattice(observed.num_bins).astype(np.float32)
+        self._observed, self._targets, self._center = observed, targets, observed.center
         self._count, self._m2 = np.zeros(num, np.float32), np.zeros(num, np.float32)
         self._mean, self._resolution = np.zeros((num, 3), np.float32), np.zeros(num, np.float32)
         self._sharpness = np.zeros(num, np.float32)
@@ -76,7 +74,7 @@ class Objective:
         if self._uses_kernel:
             from r3jax.kernels.scoring import frame_gains
 
-            found = frame_gains.gains(*self._structs(), np.asarray(frames, np.int64), self._lattice)
+            found = frame_gains.gains(*self._structs(), np.asarray(frames, np.int64))
         else:
             found = np.array([self._changed(int(frame)).gain.sum() for frame in frames])
         return found / len(self._targets)
@@ -86,7 +84,7 @@ class Objective:
         if self._uses_kernel:
             from r3jax.kernels.scoring import frame_gains
 
-            frame_gains.add(*self._structs(), frame, self._lattice, self._totals)
+            frame_gains.add(*self._structs(), frame, self._totals)
             return
         after = self._changed(frame)
         self._count[after.row], self._mean[after.row] = after.counts, after.mean
@@ -104,16 +102,16 @@ class Objective:
         seen, to = self._observed, self._targets
         return (
             kernel.Rows(
-                seen.center, self._count, self._mean, self._m2, self._resolution, self._sharpness
+                self._center, self._count, self._mean, self._m2, self._resolution, self._sharpness
             ),
             kernel.Pairs(to.first, to.target, to.weight, self._cosine, self._sides, self._value),
             kernel.Observations(
                 seen.first,
                 seen.row,
-                seen.direction,
                 seen.resolution,
                 seen.color,
                 seen.is_colored,
+                seen.position,
                 seen.sharpness,
             ),
             kernel.Targets(to.position, to.focal),
@@ -137,9 +135,9 @@ class Objective:
         pair = np.arange(length.sum()) + np.repeat(
             to.first[rows] - np.cumsum(length) + length, length
         )
-        offset = to.position[to.target[pair]] - seen.center[rows][at]
-        distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-6)
-        r, q = offset / distance[:, None], self._lattice[seen.direction[part]][at]
+        center = self._center[rows]
+        r, distance = _direction(to.position[to.target[pair]] - center[at])
+        q = _direction(seen.position[frame] - center)[0][at]
         cosine = (q * r).sum(axis=1)
         sides = self._sides[pair] | np.where(cosine > 0.0, _sides(q, r), 0).astype(np.uint8)
         cosine = np.clip(np.maximum(cosine, self._cosine[pair]), 0.0, 1.0)
@@ -147,7 +145,6 @@ class Objective:
             cosine, sides == _ALL_SIDES, _consistency(count, m2)[at],
             np.minimum(best[at] * distance / to.focal[to.target[pair]], 1.0), sharp[at],
         )  # fmt: skip
-        value = np.where(count[at] > 0.0, value, self._value[pair])
         gain = to.weight[pair] * (value - self._value[pair]).astype(np.float64)
         return _Changed(rows, count, mean, m2, best, sharp, pair, cosine, sides, value, gain)
 
@@ -166,6 +163,12 @@ class _Changed(NamedTuple):
     sides: np.ndarray
     value: np.ndarray
     gain: np.ndarray
+
+
+def _direction(offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Computes unit vectors and lengths of offsets [p, 3]."""
+    length = np.maximum(np.linalg.norm(offset, axis=1), 1e-6)
+    return offset / length[:, None], length
 
 
 def _sides(q: np.ndarray, r: np.ndarray) -> np.ndarray:
@@ -195,37 +198,3 @@ def _value(
     bias = cosine**kappa
     near = delta * bias
     return bias * delta ** (kappa * (1.0 - bias)) * ratio ** (1.0 - near) * sharpness**near
-
-
-def renderability_of(observed: Observed, targets: Targets, frames: Sequence[int]) -> np.ndarray:
-    """Computes the renderability of every target on the map of only some frames, [T].
-
-    It uses the formulas of the package from scratch, and gives the value that `Objective` updates
-    incrementally.
-    """
-    state = observed.map_of(frames)
-    sharp = np.zeros(observed.num_rows, np.float32)
-    for frame in frames:
-        shown = observed.row[observed.first[frame] : observed.first[frame + 1]]
-        sharp[shown] = np.maximum(sharp[shown], observed.sharpness[frame])
-    row = np.repeat(np.arange(observed.num_rows), np.diff(targets.first))
-    views = jnp.asarray(targets.position), jnp.asarray(targets.focal)
-    value = np.asarray(_values(state, jnp.asarray(sharp), *views))
-    shares = targets.weight.astype(np.float64) * value[targets.target, row]
-    return np.bincount(targets.target, shares, len(targets))
-
-
-@jax.jit
-def _values(
-    state: MapState,
-    sharpness: Float[Array, " N"],
-    position: Float[Array, "T 3"],
-    focal: Float[Array, " T"],
-) -> Float[Array, "T N"]:
-    """Computes R of every row from every target, reduced by blur."""
-
-    def value(view: tuple[Array, Array]) -> Float[Array, " N"]:
-        found = score_voxels(state, *view)
-        return found.value * sharpness ** (found.delta * found.bias)
-
-    return jax.lax.map(value, (position, focal))

@@ -5,13 +5,12 @@
 
 Rows are numbered in the order of their keys, so that nothing depends on the order of the frames.
 
-Shape symbols: N rows; n frames; m observations; W words of bins.
+Shape symbols: N rows; n frames; m observations.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -19,7 +18,6 @@ from r3jax.captures.capture_maps import blank, grown
 from r3jax.captures.survey import RANGE
 from r3jax.frame import Frame
 from r3jax.geometry.voxels import unpack, voxel_center
-from r3jax.mapping.join import combine_moments
 from r3jax.mapping.state import MapState, empty_map
 
 _CAPACITY = 1 << 15
@@ -35,17 +33,11 @@ class Observed:
     voxel_size: float
     """Edge of a voxel."""
 
-    num_bins: int
-    """Direction bins of a voxel."""
-
     first: np.ndarray
     """Index of the first observation of each frame, then their total number, [n + 1] int64."""
 
     row: np.ndarray
     """[m] int32, ascending within a frame."""
-
-    direction: np.ndarray
-    """Direction bin towards the camera, [m] uint8."""
 
     resolution: np.ndarray
     """[px/m], [m] float32."""
@@ -55,6 +47,9 @@ class Observed:
 
     is_colored: np.ndarray
     """False if the voxel was seen but no pixel fell into it, [m]."""
+
+    position: np.ndarray
+    """Camera center of each frame, [n, 3] float32."""
 
     sharpness: np.ndarray
     """Sharpness of each frame in (0, 1]: 1 over the width of its blur [px], [n] float32."""
@@ -78,37 +73,6 @@ class Observed:
     def frame(self) -> np.ndarray:
         """Frame of each observation, [m] int64."""
         return np.repeat(np.arange(len(self)), np.diff(self.first))
-
-    def map_of(self, frames: Sequence[int]) -> MapState:
-        """Merges the maps of some frames, on all rows."""
-        num, words = self.num_rows, -(-self.num_bins // 32)
-        moments = (jnp.zeros(num), jnp.zeros((3, num)), jnp.zeros(num))
-        visited, best = np.zeros((words, num), np.uint32), np.zeros(num, np.float32)
-        for frame in frames:
-            part = slice(int(self.first[frame]), int(self.first[frame + 1]))
-            row = self.row[part]
-            count, color = np.zeros(num, np.float32), np.zeros((3, num), np.float32)
-            count[row], color[:, row] = self.is_colored[part], self.color[part].T
-            own = (jnp.asarray(count), jnp.asarray(color), jnp.zeros(num))
-            moments = _combined(moments, own)
-            word, bit = np.divmod(self.direction[part], 32)
-            visited[word, row] |= np.uint32(1) << bit.astype(np.uint32)
-            best[row] = np.maximum(best[row], self.resolution[part])
-        count, mean, m2 = moments
-        return MapState(
-            key=jnp.asarray(self.key),
-            visited=jnp.asarray(visited),
-            count=count,
-            mean=mean,
-            m2=m2,
-            resolution=jnp.asarray(best),
-            voxel_size=jnp.float32(self.voxel_size),
-            dropped=jnp.int32(0),
-            num_bins=self.num_bins,
-        )
-
-
-_combined = jax.jit(combine_moments)
 
 
 def map_frames(
@@ -151,21 +115,20 @@ def observe(
     row_of = np.full(whole.capacity, -1, np.int32)
     row_of[occupied] = np.arange(len(occupied), dtype=np.int32)
     nothing = blank(whole)
-    parts: tuple[list[np.ndarray], ...] = tuple([] for _ in range(5))
+    parts: tuple[list[np.ndarray], ...] = tuple([] for _ in range(4))
+    position = np.empty((count, 3), np.float32)
     for number in range(count):
-        for column, own in zip(
-            parts, _part(join(nothing, whole, read(number)), row_of), strict=True
-        ):
+        frame = read(number)
+        position[number] = frame.position
+        for column, own in zip(parts, _part(join(nothing, whole, frame), row_of), strict=True):
             column.append(own)
         on_frame()
     first = np.cumsum([0, *map(len, parts[0])])
-    row, direction, resolution, color, is_colored = map(_joined, parts)
-    size = float(whole.voxel_size)
-    sharp = np.ones(count, np.float32)
+    size, sharp = float(whole.voxel_size), np.ones(count, np.float32)
+    row, resolution, color, is_colored = map(_joined, parts)
     return Observed(
-        key[:, occupied], size, whole.num_bins, first, row, direction, resolution, color,
-        is_colored, sharp,
-    )  # fmt: skip
+        key[:, occupied], size, first, row, resolution, color, is_colored, position, sharp
+    )
 
 
 def _joined(parts: list[np.ndarray]) -> np.ndarray:
@@ -186,12 +149,8 @@ def _part(seen: MapState, row_of: np.ndarray) -> tuple[np.ndarray, ...]:
     visited, count = np.asarray(seen.visited), np.asarray(seen.count)
     at = np.flatnonzero(visited.any(axis=0))
     at = at[np.argsort(row_of[at], kind="stable")]
-    words = visited[:, at]
-    word = np.argmax(words != 0, axis=0)
-    bit = np.log2(words[word, np.arange(len(at))].astype(np.float64))  # one bin, hence one bit
     return (
         row_of[at],
-        (32 * word + bit).astype(np.uint8),
         np.asarray(seen.resolution)[at],
         np.ascontiguousarray(np.asarray(seen.mean)[:, at].T),
         count[at] > 0.0,

@@ -112,7 +112,7 @@ def _cards(found: Selected) -> dict[str, str]:
     cards = {
         f"of {len(found.used)} frames kept": str(len(choice.order)),
         "of the mean R with all frames": f"{100 * float(choice.share[-1]):.0f} %",
-        "mean R of the targets": f"{float(choice.objective[-1]):.2f}",
+        "mean R of the targets": f"{float(choice.renderability[-1]):.2f}",
     }
     blurred = int(found.quality.is_blurred.sum())
     if found.quality.is_compared.any():
@@ -140,21 +140,21 @@ def _curve(found: Selected) -> Figure:
     axes = style.dress(figure.subplots(), x="frames kept", y="mean renderability of the targets")
     number = np.arange(1, len(choice.order) + 1)
     axes.plot(
-        np.append(0, number), np.append(0.0, choice.objective), color=style.ACCENT, linewidth=2
+        np.append(0, number), np.append(0.0, choice.renderability), color=style.ACCENT, linewidth=2
     )
     if len(number) <= _NUMBERED:
-        axes.plot(number, choice.objective, "o", color=style.ACCENT, markersize=4)
+        axes.plot(number, choice.renderability, "o", color=style.ACCENT, markersize=4)
     of_all = float(choice.of_all.mean())
     axes.axhline(of_all, color=style.MUTED, linewidth=1, linestyle="--")
     axes.annotate(f"all {len(found.used)} frames", (0, of_all), (4, 4), color=style.MUTED,
                   textcoords="offset points", fontsize=9)  # fmt: skip
     if (at := knee(found)) is not None:
-        value = float(choice.objective[at - 1])
+        value = float(choice.renderability[at - 1])
         axes.plot([at], [value], "o", color=style.SECOND, markersize=8)
         axes.annotate(f"{at} frames: 95 %", (at, value), (8, -14), color=style.SECOND,
                       textcoords="offset points", fontsize=9, fontweight="bold")  # fmt: skip
     axes.set_xlim(0, None)
-    axes.set_ylim(0, 1.12 * max(of_all, float(choice.objective.max())))
+    axes.set_ylim(0, 1.12 * max(of_all, float(choice.renderability.max())))
     return figure
 
 

@@ -81,9 +81,6 @@ class Observations(NamedTuple):
     row: Any
     """[m] int32, ascending within a frame."""
 
-    direction: Any
-    """Direction bin towards the camera, [m] uint8."""
-
     resolution: Any
     """[px/m], [m] float32."""
 
@@ -92,6 +89,9 @@ class Observations(NamedTuple):
 
     is_colored: Any
     """False where no pixel fell into the voxel, which was seen anyway, [m]."""
+
+    position: Any
+    """Camera center of each frame, [n, 3] float32 [m]."""
 
     sharpness: Any
     """Of each frame, in (0, 1], [n] float32."""
@@ -121,15 +121,21 @@ def _color_after(rows, row, color, at):
 
 
 @inlined_fused
+def _towards(position, camera, center, row):
+    """Returns the unit vector from a voxel to a camera, and their distance."""
+    x = position[camera, 0] - center[row, 0]
+    y = position[camera, 1] - center[row, 1]
+    z = position[camera, 2] - center[row, 2]
+    distance = max(math.sqrt(x * x + y * y + z * z), _LEAST)
+    inverse = _ONE / distance
+    return x * inverse, y * inverse, z * inverse, distance
+
+
+@inlined_fused
 def _pair_after(rows, pairs, targets, row, pair, q, delta, log_delta, best, log_sharp):
     """Returns cosine, sides and renderability of a pair after another direction q was seen."""
     target = pairs.target[pair]
-    x = targets.position[target, 0] - rows.center[row, 0]
-    y = targets.position[target, 1] - rows.center[row, 1]
-    z = targets.position[target, 2] - rows.center[row, 2]
-    distance = max(math.sqrt(x * x + y * y + z * z), _LEAST)
-    inverse = _ONE / distance
-    x, y, z = x * inverse, y * inverse, z * inverse
+    x, y, z, distance = _towards(targets.position, target, rows.center, row)
     cosine, sides = q[0] * x + q[1] * y + q[2] * z, pairs.sides[pair]
     if cosine > _ZERO:
         is_pole = x * x + y * y < _POLE
@@ -164,7 +170,7 @@ def _row_after(rows, observations, at):
 
 
 @called_from_python(parallel=True)
-def _gains(rows, pairs, observations, targets, candidates, lattice, workers, out):
+def _gains(rows, pairs, observations, targets, candidates, workers, out):
     num = candidates.shape[0]
     for worker in prange(workers):
         for c in range(worker, num, workers):
@@ -174,12 +180,11 @@ def _gains(rows, pairs, observations, targets, candidates, lattice, workers, out
                 begin, end = pairs.first[row], pairs.first[row + 1]
                 if begin == end:
                     continue
-                count, _, _, _, _, delta, best = _row_after(rows, observations, at)
-                if count == _ZERO:
-                    continue
-                log_delta, k = log2_or_never(delta), observations.direction[at]
+                _, _, _, _, _, delta, best = _row_after(rows, observations, at)
+                log_delta = log2_or_never(delta)
                 log_sharp = log2(max(rows.sharpness[row], observations.sharpness[frame]))
-                q = lattice[k, 0], lattice[k, 1], lattice[k, 2]
+                x, y, z, _ = _towards(observations.position, frame, rows.center, row)
+                q = x, y, z
                 for pair in range(begin, end):
                     _, _, value = _pair_after(
                         rows, pairs, targets, row, pair, q, delta, log_delta, best, log_sharp
@@ -189,25 +194,24 @@ def _gains(rows, pairs, observations, targets, candidates, lattice, workers, out
 
 
 @called_from_python()
-def _add(rows, pairs, observations, targets, frame, lattice, totals):
+def _add(rows, pairs, observations, targets, frame, totals):
     for at in range(observations.first[frame], observations.first[frame + 1]):
         row = observations.row[at]
         count, m0, m1, m2, spread, delta, best = _row_after(rows, observations, at)
         rows.count[row], rows.m2[row], rows.resolution[row] = count, spread, best
         rows.mean[row, 0], rows.mean[row, 1], rows.mean[row, 2] = m0, m1, m2
-        log_delta, k = log2_or_never(delta), observations.direction[at]
+        log_delta = log2_or_never(delta)
         rows.sharpness[row] = max(rows.sharpness[row], observations.sharpness[frame])
         log_sharp = log2(rows.sharpness[row])
-        q = lattice[k, 0], lattice[k, 1], lattice[k, 2]
+        x, y, z, _ = _towards(observations.position, frame, rows.center, row)
+        q = x, y, z
         for pair in range(pairs.first[row], pairs.first[row + 1]):
             cosine, sides, value = _pair_after(
                 rows, pairs, targets, row, pair, q, delta, log_delta, best, log_sharp
             )
-            pairs.cosine[pair], pairs.sides[pair] = cosine, sides
-            if count > _ZERO:
-                change = pairs.weight[pair] * (value - pairs.value[pair])
-                totals[pairs.target[pair]] += change
-                pairs.value[pair] = value
+            change = pairs.weight[pair] * (value - pairs.value[pair])
+            totals[pairs.target[pair]] += change
+            pairs.cosine[pair], pairs.sides[pair], pairs.value[pair] = cosine, sides, value
 
 
 def gains(
@@ -216,7 +220,6 @@ def gains(
     observations: Observations,
     targets: Targets,
     candidates: np.ndarray,
-    lattice: np.ndarray,
 ) -> np.ndarray:
     """Computes what each of some frames would add to the sum of the targets' renderability, [c].
 
@@ -226,11 +229,10 @@ def gains(
         observations: of all frames.
         targets: whose renderability counts.
         candidates: numbers of the frames, [c] int64.
-        lattice: directions of the bins, [B, 3] float32.
     """
     require_threads()
     out = np.empty(len(candidates))
-    _gains(rows, pairs, observations, targets, candidates, lattice, num_workers(), out)
+    _gains(rows, pairs, observations, targets, candidates, num_workers(), out)
     return out
 
 
@@ -240,8 +242,7 @@ def add(
     observations: Observations,
     targets: Targets,
     frame: int,
-    lattice: np.ndarray,
     totals: np.ndarray,
 ) -> None:
     """Adds a frame to rows and pairs, and what it gives each target to `totals` [T], in place."""
-    _add(rows, pairs, observations, targets, frame, lattice, totals)
+    _add(rows, pairs, observations, targets, frame, totals)

@@ -4,6 +4,7 @@ import numpy as np
 
 from r3jax.apps.select.observations import Observed
 from r3jax.apps.select.targets import Targets
+from r3jax.kernels.constants import ON_EDGE
 
 
 def observed_of(seed: int, frames: int = 9, rows: int = 40, scenes: int = 1) -> Observed:
@@ -23,13 +24,12 @@ def observed_of(seed: int, frames: int = 9, rows: int = 40, scenes: int = 1) -> 
     return Observed(
         key=key,
         voxel_size=0.1,
-        num_bins=64,
         first=np.cumsum([0, *map(len, parts)]),
         row=row,
-        direction=rng.integers(0, 64, size).astype(np.uint8),
         resolution=rng.uniform(50.0, 400.0, size).astype(np.float32),
         color=rng.normal(0.5, 0.1, (size, 3)).clip(0, 1).astype(np.float32),
         is_colored=rng.random(size) < 0.8,
+        position=rng.uniform(-1.0, 4.0, (frames, 3)).astype(np.float32),
         sharpness=rng.choice([1.0, 0.6, 0.3], frames).astype(np.float32),
     )
 
@@ -55,10 +55,47 @@ def shuffled(observed: Observed, order: np.ndarray) -> Observed:
     index = np.concatenate([np.arange(observed.first[i], observed.first[i + 1]) for i in order])
     columns = {
         name: getattr(observed, name)[index]
-        for name in ("row", "direction", "resolution", "color", "is_colored")
+        for name in ("row", "resolution", "color", "is_colored")
     }
     first = np.cumsum([0, *np.diff(observed.first)[order]])
     return Observed(
-        key=observed.key, voxel_size=0.1, num_bins=64, first=first,
+        key=observed.key, voxel_size=0.1, first=first, position=observed.position[order],
         sharpness=observed.sharpness[order], **columns,
     )  # fmt: skip
+
+
+def renderability_of(observed: Observed, targets: Targets, frames: list[int]) -> np.ndarray:
+    """R of each target from some frames, [T], pair by pair from the formulas in float64."""
+    totals, center = np.zeros(len(targets)), observed.center.astype(np.float64)
+    for row in range(observed.num_rows):
+        seen = [
+            (frame, at)
+            for frame in frames
+            for at in range(observed.first[frame], observed.first[frame + 1])
+            if observed.row[at] == row
+        ]
+        if not seen:
+            continue
+        colors = [observed.color[at] for _, at in seen if observed.is_colored[at]]
+        colors = np.array(colors, np.float64).reshape(-1, 3)
+        variance = colors.var(axis=0, ddof=1).sum() if len(colors) > 1 else 0.0
+        delta = float(np.clip(1.0 - np.sqrt(2 / 1.5 * variance), 0.0, 1.0))
+        best = max(float(observed.resolution[at]) for _, at in seen)
+        sharp = max(float(observed.sharpness[frame]) for frame, _ in seen)
+        q = np.array([observed.position[frame] for frame, _ in seen], np.float64) - center[row]
+        q /= np.linalg.norm(q, axis=1, keepdims=True)
+        for pair in range(targets.first[row], targets.first[row + 1]):
+            target = targets.target[pair]
+            offset = targets.position[target].astype(np.float64) - center[row]
+            distance = np.linalg.norm(offset)
+            r = offset / distance
+            cosine = float(np.clip((q @ r).max(), 0.0, 1.0))
+            e1 = np.cross([0.0, 0.0, 1.0], r)
+            flat = q[q @ r > 0.0] @ np.stack([e1, np.cross(r, e1)], axis=1)
+            low, high = flat.min(axis=0, initial=np.inf), flat.max(axis=0, initial=-np.inf)
+            kappa = 1.0 if (low <= ON_EDGE).all() and (high >= -ON_EDGE).all() else 2.0
+            bias = cosine**kappa
+            ratio = min(best * distance / float(targets.focal[target]), 1.0)
+            value = bias * delta ** (kappa * (1.0 - bias)) * ratio ** (1.0 - delta * bias)
+            totals[target] += targets.weight[pair] * value * sharp ** (delta * bias)
+    return totals

@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from r3jax.apps.select.choose import Choice, choose, component_of, in_proportion, tie_ranks
-from r3jax.apps.select.objective import renderability_of
-from tests.apps.select.made_up import observed_of, shuffled, targets_of
+from tests.apps.select.made_up import observed_of, renderability_of, shuffled, targets_of
 
 SEEDS = st.integers(0, 500)
 
@@ -25,7 +24,7 @@ def test_the_record_is_that_of_the_maps_of_the_frames_chosen(seed, num):
     targets = targets_of(observed, seed)
     found = choose(observed, targets, num)
     assert len(set(found.order.tolist())) == num
-    np.testing.assert_allclose(np.cumsum(found.gain), found.objective, atol=1e-5)
+    np.testing.assert_allclose(np.cumsum(found.gain), found.renderability, atol=1e-5)
     oracle = renderability_of(observed, targets, found.order.tolist())
     np.testing.assert_allclose(found.per_target[-1], oracle, atol=1e-5)
     assert (found.left[found.order] == 0.0).all()
@@ -43,7 +42,7 @@ def test_exact_greedy_takes_the_best_of_all_in_each_step(seed):
             for frame in range(len(observed))
             if frame not in before
         ]
-        assert found.objective[step] == pytest.approx(max(values), abs=1e-5)
+        assert found.renderability[step] == pytest.approx(max(values), abs=1e-5)
 
 
 @given(SEEDS, st.integers(2, 6), st.booleans())

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r3jax.apps.select.objective import Objective, renderability_of
-from tests.apps.select.made_up import observed_of, targets_of
+from r3jax.apps.select.objective import Objective
+from tests.apps.select.made_up import observed_of, renderability_of, targets_of
 
 SEEDS = st.integers(0, 500)
 

@@ -27,7 +27,7 @@ def test_the_order_of_the_frames_does_not_matter(frames):
     order = np.random.default_rng(0).permutation(len(frames))
     again = r3jax.select_frames([frames[i] for i in order], 4, voxel_size=0.15)
     assert set(order[again.order].tolist()) == set(found.order.tolist())
-    np.testing.assert_allclose(again.objective, found.objective, atol=1e-5)
+    np.testing.assert_allclose(again.renderability, found.renderability, atol=1e-5)
 
 
 def test_the_targets_render_nearly_as_well_on_a_map_of_the_frames_chosen(frames):
@@ -54,7 +54,7 @@ def test_blur_counts_from_the_very_place_of_a_frame(frames):
     own = np.asarray(frames[0].T_world_camera)[None]
     seen = lambda blur: r3jax.select_frames(
         frames[:1], 1, targets=own, blur=[blur], voxel_size=0.15
-    ).objective[-1]  # fmt: skip
+    ).renderability[-1]  # fmt: skip
     assert seen(4.0) == pytest.approx(seen(1.0) / 4.0, rel=0.02)
 
 
