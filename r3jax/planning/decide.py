@@ -386,8 +386,10 @@ def travel_of(
     near = np.asarray(map_state.present) & (center[2] < tallest)
     voxels = center[:, near].T.astype(np.float64, order="C")
     size = float(map_state.voxel_size)
-    stood = None if state.taken is None else state.taken[:, :2].astype(np.float64)
-    room = room_for(body, grid, voxels, size, pose, state.camera, trail, stood)
+    stood = headings = None
+    if state.taken is not None:
+        stood, headings = (state.taken[:, i : i + 2].astype(np.float64) for i in (0, 3))
+    room = room_for(body, grid, voxels, size, pose, state.camera, trail, stood, headings)
     travel = plan_travel(grid, position, trail=trail, heights=heights, room=room)
     places = position[None, :2] if stood is None else np.concatenate([position[None, :2], stood])
     return replace(travel, fresh=fresh_columns(travel, trail, places))

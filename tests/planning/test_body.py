@@ -195,6 +195,27 @@ def test_a_thin_thing_that_the_map_does_not_hold_is_an_obstacle(height):
     assert not np.isfinite(room.cost[18:]).any()
 
 
+def test_a_low_camera_that_looks_down_trusts_the_floor_near_its_views_only():
+    """From afar its image ends below a shelf, and shows the floor below it."""
+    free = all_free()
+    free[:, :, :2] = False  # nothing is known of the lowest layer, but for the floor's voxels
+    camera = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)  # 22 degrees up and down
+    down = pose_at(1.0, 2.0, 0.3)
+    angle = np.radians(30.0)
+    level = down[:3, :3].copy()
+    down[:3, 2] = np.cos(angle) * level[:, 2] - np.sin(angle) * np.array([0.0, 0.0, 1.0])
+    down[:3, 1] = np.cross(down[:3, 2], level[:, 0])
+    opened = lambda pose, *views: room_for(
+        Body(0.1), grid_of(free), floor_voxels(), VOXEL, pose, camera, None, *views
+    ).fits(np.array([[1.4, 2.0], [2.4, 2.0], [3.4, 2.0]]))
+    np.testing.assert_array_equal(opened(pose_at(1.0, 2.0, 0.3)), [True, True, True])
+    np.testing.assert_array_equal(opened(down), [True, False, False])
+    places = np.array([[1.0, 2.0], [2.0, 2.0]])
+    toward, away = np.array([[1.0, 0.0], [1.0, 0.0]]), np.array([[1.0, 0.0], [-1.0, 0.0]])
+    np.testing.assert_array_equal(opened(down, places, toward), [True, True, False])
+    np.testing.assert_array_equal(opened(down, places, away), [True, False, False])
+
+
 @pytest.mark.parametrize("top", [0.5, 0.75, 1.0])
 def test_the_top_of_a_table_is_not_the_floor(top):
     """A level camera at 1.5 m shows it long before it shows the floor."""

@@ -137,6 +137,7 @@ def room_for(
     camera: Camera | None = None,
     trail: np.ndarray | None = None,
     stood: np.ndarray | None = None,
+    headings: np.ndarray | None = None,
 ) -> Room:
     """Makes the plan for a body with a footprint.
 
@@ -149,6 +150,7 @@ def room_for(
         camera: its lens, which tells how near it sees the floor; None: it does not.
         trail: cells that the robot has come through, [X, Y, Z] bool.
         stood: where its views were taken, the first one first, [V, 2] [m]; None: here only.
+        headings: viewing directions of these views, [V, 2]; None: any.
     """
     known = _Known.of(body, grid, voxels, voxel_size, T_world_camera, trail)
     thin = known.thin_obstacles()
@@ -156,8 +158,15 @@ def room_for(
     pixel = known.size / num
     by_pixel = lambda columns: np.repeat(np.repeat(columns, num, axis=0), num, axis=1)
     seen = by_pixel(known.seen_columns(_highest_seen(camera, T_world_camera, known.height, body)))
-    floor = known.seen_floor(num)
-    passable = by_pixel(known.columns()) | (floor & seen)
+    floor = by_pixel(known.floor_columns()) | (known.seen_floor(num) & seen)
+    reach = known.reach_above_floor(camera, T_world_camera)
+    if camera is not None and reach < _MAX_BLIND:
+        ahead = np.asarray(T_world_camera, np.float64)[:2, 2]
+        places, ways = known.position[None, :2], ahead[None]
+        if stood is not None and headings is not None:
+            places, ways = np.concatenate([places, stood]), np.concatenate([ways, headings])
+        floor &= known.shown_within(camera, places, ways, reach, num)
+    passable = by_pixel(known.columns()) | floor
     if body.unknown_below == "free":
         blind = _blind_radius(camera, T_world_camera, known.height)
         first = known.position[:2] if stood is None or not len(stood) else stood[0]
@@ -322,14 +331,19 @@ class _Known:
     def columns(self) -> np.ndarray:
         """Finds columns that are free as far as the body takes them up, [X, Y] bool.
 
-        Those that the robot has come through are free, too; and those where the floor was seen,
-        with nothing on it or beside them, and all above the floor's own cell is free.
+        Those that the robot has come through are free, too.
+        """
+        return np.all(self.free | ~self.within, axis=2) | self.been
+
+    def floor_columns(self) -> np.ndarray:
+        """Finds columns where the floor was seen, and all above its own cell is free, [X, Y] bool.
+
+        With nothing on it or beside them.
         """
         has_floor = np.zeros(self.free.shape[:2], bool)
         has_floor[tuple(self.cells[self.is_floor, :2].T)] = True
-        free = self.free | ~self.within
-        above_floor = np.all(free | self.holds_floor, axis=2)
-        return np.all(free, axis=2) | self.been | (above_floor & has_floor & ~self.beside)
+        above_floor = np.all(self.free | ~self.within | self.holds_floor, axis=2)
+        return above_floor & has_floor & ~self.beside
 
     def seen_columns(self, blind: float) -> np.ndarray:
         """Finds columns in which nothing that the camera could see is unknown, [X, Y] bool.
@@ -366,6 +380,43 @@ class _Known:
         least = max(1.0, self.voxel_size * num / self.size)
         is_clear = np.repeat(np.repeat(~self.beside, num, axis=0), num, axis=1)
         return _closed(seen, least) | (_closed(seen, least + 1.0) & is_clear)
+
+    def reach_above_floor(self, camera: Camera | None, T_world_camera: np.ndarray) -> float:
+        """Computes up to where the image shows what stands on the floor it shows [m].
+
+        A low camera that looks down shows the floor far off, and nothing above it: the floor below
+        a shelf, and not the shelf.
+        """
+        slope = _upper_slope(camera, T_world_camera)
+        if slope >= 0.0:
+            return math.inf
+        needed = _highest_seen(camera, T_world_camera, self.height, self.body)
+        return (self.height - min(needed, self.low + 0.5 * self.size)) / -slope
+
+    def shown_within(
+        self, camera: Camera, places: np.ndarray, headings: np.ndarray, reach: float, num: int
+    ) -> np.ndarray:
+        """Finds pixels that a view had ahead of it within a distance, [num X, num Y] bool.
+
+        Args:
+            camera: its lens.
+            places: where the views were taken, [V, 2] [m].
+            headings: their viewing directions, [V, 2].
+            reach: the distance [m].
+            num: pixels along a cell.
+        """
+        pixel, shape = self.size / num, (num * self.free.shape[0], num * self.free.shape[1])
+        found = np.zeros(shape, bool)
+        x, y = (self.origin[i] + pixel * (np.arange(shape[i]) + 0.5) for i in (0, 1))
+        least = float(camera.fx) / math.hypot(float(camera.fx), 0.5 * camera.width)  # a cosine
+        for place, ahead in zip(places, headings, strict=True):
+            begin = np.floor((place - reach - self.origin[:2]) / pixel).astype(int).clip(0)
+            i, j = (slice(k, k + int(2 * reach / pixel) + 2) for k in begin)
+            dx, dy = x[i, None] - place[0], y[None, j] - place[1]
+            gap, norm = np.hypot(dx, dy), max(float(np.hypot(*ahead)), 1e-9)
+            is_ahead = (dx * ahead[0] + dy * ahead[1]) / norm >= least * gap
+            found[i, j] |= is_ahead & (gap <= reach)
+        return found
 
     def blind_spot(
         self, known: np.ndarray, first: np.ndarray, blind: float, num: int
@@ -557,12 +608,17 @@ def _highest_seen(
     camera: Camera | None, T_world_camera: np.ndarray, height: float, body: Body
 ) -> float:
     """Computes how high above the floor the image shows what the robot is about to reach [m]."""
+    slope = _upper_slope(camera, T_world_camera)
+    return math.inf if slope >= 0.0 else height + slope * (body.needed + _AHEAD)
+
+
+def _upper_slope(camera: Camera | None, T_world_camera: np.ndarray) -> float:
+    """Computes the slope of the ray through the middle of the image's upper border."""
     if camera is None:
         return math.inf
     T = np.asarray(T_world_camera, np.float64)
     ray = T[:3, :3] @ np.array([0.0, -float(camera.cy) / float(camera.fy), 1.0])
-    slope = ray[2] / max(float(np.hypot(ray[0], ray[1])), 1e-9)
-    return math.inf if slope >= 0.0 else height + slope * (body.needed + _AHEAD)
+    return float(ray[2]) / max(float(np.hypot(ray[0], ray[1])), 1e-9)
 
 
 def _blind_radius(camera: Camera | None, T_world_camera: np.ndarray, height: float) -> float:
