@@ -153,38 +153,6 @@ def refused(capsys, *words):
     return said
 
 
-def test_what_is_no_capture_is_named(captures, tmp_path, capsys):
-    assert "there is no such folder" in refused(capsys, tmp_path / "nowhere")
-    assert "this is neither a run" in refused(capsys, tmp_path)
-    bare = write_nerfstudio(tmp_path / "bare", round_poses(2), depth=False)
-    content = json.loads((bare / "transforms.json").read_text())
-    del content["ply_file_path"]
-    (bare / "transforms.json").write_text(json.dumps(content))
-    assert "neither depth images nor points" in refused(capsys, bare)
-    said = refused(capsys, captures / "recording", "--path", tmp_path / "nowhere.json")
-    assert "no such folder" in said
-
-
-def test_nothing_but_an_audit_is_overwritten(captures, tmp_path, capsys):
-    (tmp_path / "thesis.txt").write_text("precious")
-    said = refused(capsys, captures / "recording", "--out", tmp_path)
-    assert "--out" in said
-    said = refused(capsys, captures / "recording", "--out", tmp_path / "thesis.txt")
-    assert "this is a file" in said
-
-
-def test_settings_without_sense_are_named(captures, tmp_path, capsys):
-    for words, message in (
-        (("--voxel-size", "0"), "--voxel-size must be positive"),
-        (("--voxel-size", "1e-7"), "voxels along an axis"),
-        (("--voxel-size", "30"), "larger than a fifth of the range"),
-        (("--folds", "1"), "--folds must be at least 2"),
-    ):
-        said = refused(capsys, captures / "recording", "--out", tmp_path / "out", *words)
-        assert message in said
-    assert not (tmp_path / "out").exists()
-
-
 def test_a_missing_picture_is_named(captures, tmp_path, capsys):
     capture = write_nerfstudio(tmp_path / "holes", round_poses(3), depth=True)
     (capture / "images" / "001.png").unlink()

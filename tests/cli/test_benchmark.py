@@ -103,24 +103,6 @@ def test_every_value_of_a_sweep_makes_a_cell(room, tmp_path, capsys):
     assert "r3-pano (lambda2=0.8)" in out
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("--sweep", "lambda2"),
-        ("--sweep", "lambda2=0.2,0.2"),
-        ("--sweep", "lambda2=0.2", "--sweep", "lambda2=0.3"),
-        ("--sweep", "num_candidates=3"),  # --settings has it
-        ("--sweep", "lambda2=0.2,much"),
-        ("--reference", "frontier (lambda2=1)"),
-    ],
-)
-def test_a_sweep_or_reference_that_cannot_work_starts_nothing(room, tmp_path, capsys, words):
-    assert benchmark(room, tmp_path, *words) == 2
-    told = capsys.readouterr().err
-    assert words[-1].partition("=")[0] in told
-    assert not (tmp_path / "cells").exists()
-
-
 @pytest.mark.full
 def test_another_setting_makes_another_cell_beside_the_first(room, finished, capsys):
     before = read(finished)
@@ -152,37 +134,6 @@ def test_a_cell_that_fails_is_named_and_the_exit_code_says_so(room, tmp_path, ca
     monkeypatch.undo()
     assert benchmark(room, tmp_path) == 0
     assert len(read(tmp_path)) == 2
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"photos": "captures/lounge"}, "r3jax select"),
-        ({"scenes": "castle"}, "'castle'"),
-        ({"scenes": ""}, "no scenes"),
-        ({"policies": "oracle"}, "'oracle'"),
-        ({"seeds": "0,x"}, "--seeds"),
-        ({"seeds": "1,1"}, "1, 1"),
-        ({"budget": "views"}, "views:100"),
-        ({"snapshots": "views:9"}, "views:9"),
-        ({"train_resolution": 64}, "train_resolution 64"),
-        ({"test_views": 3}, "max_views"),
-        ({"jobs": -1}, "--jobs"),
-        ({"slurm": "partition"}, "--slurm"),
-    ],
-)
-def test_a_mistake_gets_one_line_and_starts_nothing(room, tmp_path, capsys, changes, message):
-    assert benchmark(room, tmp_path, **changes) == 2
-    lines = [x for x in capsys.readouterr().err.splitlines() if x.startswith("r3jax:")]
-    assert len(lines) == 1
-    assert message in lines[0]
-    assert not (tmp_path / "cells").exists()
-
-
-@pytest.mark.parametrize("word", ["num_candidates=many", "nothing=1", "scoring.kappa=ball"])
-def test_a_setting_that_cannot_work_is_named(room, tmp_path, capsys, word):
-    assert benchmark(room, tmp_path, word) == 2
-    assert word.partition("=")[0].removeprefix("scoring.") in capsys.readouterr().err
 
 
 def test_a_folder_that_cannot_be_written_gets_one_line(room, tmp_path, capsys):

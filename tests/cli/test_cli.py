@@ -79,12 +79,6 @@ def test_a_command_that_does_not_exist_gets_the_one_that_was_meant(words, capsys
     assert not told.out
 
 
-@pytest.mark.parametrize(("name", "kind"), [("my_scan.zip", "file"), ("my_scan", "folder")])
-def test_a_capture_that_is_not_there_is_called_what_it_would_be(tmp_path, name, kind, capsys):
-    assert main(["audit", str(tmp_path / name)]) == 2
-    assert f"{name}: there is no such {kind}" in capsys.readouterr().err
-
-
 def test_info_lists_what_there_is(capsys):
     assert main(["info"]) == 0
     text = capsys.readouterr().out
@@ -102,39 +96,6 @@ def test_info_follows_a_recording(shared, tmp_path, capsys):
     assert [int(words[0]) for words in frames] == list(range(48))
     assert float(frames[0][1]) == 0.0 < float(frames[20][1]) <= 1.0
     assert plot.read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--scene", "castle"], ["'castle'", "flat", "mesh:<file>"]),
-        (["--policy", "oracle"], ["'oracle'", "frontier"]),
-        (["--budget", "minutes:5"], ["minutes:5", "views:100"]),
-        (["--resolution", "3"], ["--resolution"]),
-        (["--voxel-size", "-1"], ["voxel_size"]),
-        (["--max-range", "5000"], ["max_range", "13.1 m"]),
-        (["--scene", "mesh:/nowhere/house.glb"], ["/nowhere/house.glb"]),
-        (["--scene", "mesh:"], ["mesh:"]),
-        (["--start", "50", "0", "0"], ["50"]),
-        (["--seed", "9223372036854775808"], ["--seed"]),
-        (["--capacity", "1099511627776"], ["capacity"]),
-        (["--cell-size", "1e-300"], ["cell_size"]),
-    ],
-)
-def test_a_mistake_gets_one_line_and_no_traceback(room, tmp_path, capsys, words, message):
-    assert explore(room, tmp_path, *words) == 2
-    error = capsys.readouterr().err.strip().splitlines()[-1]
-    assert error.startswith("r3jax: ")
-    for part in message:
-        assert part in error
-    assert not (tmp_path / "box").exists()
-
-
-def test_a_folder_that_is_neither_run_nor_recording_is_said_so(tmp_path, capsys):
-    assert main(["info", str(tmp_path)]) == 2
-    assert "neither a run" in capsys.readouterr().err
-    assert main(["info", str(tmp_path / "nowhere")]) == 2
-    assert "no such folder" in capsys.readouterr().err
 
 
 @pytest.mark.full

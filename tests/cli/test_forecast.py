@@ -68,20 +68,6 @@ def test_a_calibration_of_ones_own(runs, tmp_path, capsys):
     assert told[1] == pytest.approx(told[0] + 10.0, abs=0.11)
 
 
-@pytest.mark.parametrize(
-    ("words", "reason"),
-    [
-        (["forecast", "no-run"], "no-run"),
-        (["explore", "--scene", "flat", "--until", "psnr:high"], "'high'"),
-    ],
-)
-def test_what_cannot_work_is_told(words, reason, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert main(words) == 2
-    assert reason in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.full
 def test_a_file_that_is_no_calibration_is_told(runs, tmp_path, capsys):
     path = tmp_path / "mine.json"

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from r3jax.cli.main import main
 from r3jax.runs.reader import read_run
 from r3jax.runs.settings import open_run_scene
 from r3jax.simulators.scenes.registry import open_scene, scene_hash
@@ -93,17 +92,3 @@ def test_a_recorded_run_opens_its_scene_at_its_scale(tmp_path):
     scene.clear()  # headers did not always say the scale
     scene.update(older, name=meters, hash=scene_hash(plain))
     np.testing.assert_array_equal(open_run_scene(run).bounds, plain.bounds)
-
-
-@pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_scale_that_is_none(tmp_path, scale, capsys):
-    write_room(tmp_path / "room.ply")
-    words = ["explore", "--scene", f"mesh:{tmp_path / 'room.ply'}", "--scale", str(scale)]
-    assert main([*words, "--out", str(tmp_path / "runs")]) == 2
-    assert "scale" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("scene", ["flat", "replica:office0"])
-def test_a_scale_is_for_mesh_files(tmp_path, scene, capsys):
-    assert main(["explore", "--scene", scene, "--scale", "0.1", "--out", str(tmp_path)]) == 2
-    assert "mesh" in capsys.readouterr().err

@@ -182,20 +182,6 @@ def test_frames_that_must_stay_stay(captures, tmp_path):
     assert {names[5].name, names[6].name} <= set(record_of(tmp_path / "out")["kept"])
 
 
-@pytest.mark.parametrize(("words", "named"), [
-    (("--frames", "3", "--share", "0.5"), "--share"),
-    (("--frames", "0"), "--frames"),
-    (("--gain", "1.5"), "--gain"),
-    (("--keep", "nobody.png"), "nobody.png"),
-    (("--targets", "no_such_file.json"), "no_such_file.json"),
-])  # fmt: skip
-def test_what_cannot_be_done_is_one_line_with_its_option(captures, tmp_path, capsys, words, named):
-    assert select(captures / "recording", tmp_path / "out", *words) == 2
-    said = capsys.readouterr().err.strip().splitlines()[-1]
-    assert named in said
-    assert not (tmp_path / "out" / "selection.json").exists()
-
-
 def test_targets_may_be_a_path_but_not_outside_of_the_capture(captures, tmp_path, capsys):
     inside = np.stack([pose_at([2.0, 1.5, 1.2], [4.0, 1.5, 1.2])])
     write_camera_path(tmp_path / "in.json", inside, LENS.camera)
@@ -309,14 +295,6 @@ def test_frames_that_share_nothing_are_refused(tmp_path, capsys):
     np.savetxt(tmp_path / "apart" / "poses.txt", poses.reshape(-1, 16), fmt="%.17g")
     assert select(tmp_path / "apart", tmp_path / "out", "--frames", "1") == 2
     assert "same surface" in capsys.readouterr().err
-
-
-def test_pictures_without_poses_are_refused(tmp_path, capsys):
-    (tmp_path / "photos").mkdir()
-    for i in range(3):
-        Image.new("RGB", (32, 24), (90, 80, 20 * i)).save(tmp_path / "photos" / f"{i}.png")
-    assert select(tmp_path / "photos", tmp_path / "out", "--frames", "2") == 2
-    assert "photos" in capsys.readouterr().err
 
 
 def test_twins_are_left_out_and_named(captures, tmp_path):

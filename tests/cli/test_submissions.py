@@ -85,12 +85,7 @@ def test_a_submission_stands_in_the_table_beside_a_policy(room, exported, tmp_pa
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--check"], "--submission FILE"),
-        (["--submission", "nowhere.jsonl"], "nowhere.jsonl"),
-        (["--submission", "{it}", "--budget", "views:9"], "--budget"),
-        (["--submission", "{it}", "--policies", "r3"], "--policies"),
         (["--submission", "{it}", "{it}"], "policy.name"),
-        (["--submission", "{it}", "--scenes", "office"], "mesh:<file>"),
         (["--submission", "{bad}"], "hash"),
         (["--submission", "{it}", "--train-resolution", "64"], "train_resolution 64"),
         (["--submission", "{it}", "--snapshots", "views:9"], "views:9"),

@@ -82,22 +82,6 @@ def test_two_processes_do_not_write_one_team(room, pair, tmp_path, capsys):
     assert "holds something that is not a team" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--cameras", "3"], "--fov takes one value for all 3 cameras or one for each, got 2"),
-        (["--cameras", "0"], "--cameras"),
-        (["--meet-every", "-1"], "--meet-every"),
-        (["--policy", "nobody"], "'nobody'"),
-        (["--start", "50", "0", "0"], "outside the world"),
-    ],
-)
-def test_what_cannot_fly_is_refused(room, tmp_path, capsys, words, message):
-    assert team(room, tmp_path, *words) == 2
-    assert message in " ".join(capsys.readouterr().err.split())
-    assert not (tmp_path / "pair").exists()
-
-
 @pytest.mark.full
 @pytest.mark.parametrize(
     ("command", "message"),

@@ -121,29 +121,3 @@ def test_resume_of_other_settings_is_refused(recording, models, capsys):
     assert train(recording, models, "--resume", seed=7) == 2
     assert "seed" in capsys.readouterr().err
     assert (models / "last" / "train.json").read_bytes() == record
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"hold_out": 1}, "hold out nothing"),
-        ({"resolution": 3}, "--resolution"),
-        ({"iterations": 0}, "iterations"),
-        ({"views_per_step": 10**9}, "2^31"),
-        ({"capacity": 10}, "capacity 10"),
-        ({"gaussians": 10**9}, "GB"),
-    ],
-)
-def test_a_mistake_gets_one_line_and_no_model(recording, tmp_path, capsys, changes, message):
-    assert train(recording, tmp_path / "m", **changes) == 2
-    lines = [x for x in capsys.readouterr().err.splitlines() if x.startswith("r3jax:")]
-    assert len(lines) == 1
-    assert message in lines[0]
-    assert not (tmp_path / "m" / "last" / "scene.ply").exists()
-
-
-def test_a_folder_that_is_neither_run_nor_recording(tmp_path, capsys):
-    assert main(["train", str(tmp_path)]) == 2
-    assert "neither a run" in capsys.readouterr().err
-    assert main(["train", str(tmp_path / "nowhere")]) == 2
-    assert "no such folder" in capsys.readouterr().err

@@ -41,17 +41,6 @@ def busy_port():
         yield other.getsockname()[1]
 
 
-def test_a_folder_that_is_nothing_to_look_at_is_told(tmp_path, capsys):
-    pytest.importorskip("viser", reason="the viewer needs viser, which is not installed")
-    assert "a run (run.json)" in say(["view", tmp_path], capsys)
-    assert "there is no such folder" in say(["view", tmp_path / "nowhere"], capsys)
-
-
-def test_options_of_runs_are_refused_for_captures(tmp_path, capsys):
-    for option in ("--name", "--export"):
-        assert option in say(["view", tmp_path, option, "other"], capsys)
-
-
 def test_a_run_without_views_is_told(path, tmp_path, capsys):
     copy = shutil.copytree(path, tmp_path / "copy")
     (copy / "trace.jsonl").write_text("")
@@ -91,10 +80,6 @@ def test_without_av_the_extra_is_named_before_anything_is_drawn(
     line = say(["view", path, "--export", out, "--video"], capsys)
     assert "pip install 'r3jax[viewer]'" in line
     assert not out.exists()
-
-
-def test_a_film_without_a_folder_is_told(path, capsys):
-    assert "--export" in say(["view", path, "--video"], capsys)
 
 
 def test_a_model_that_is_not_there_is_told(path, capsys):

@@ -87,7 +87,7 @@ from tests.formats.bags import write_bag
 from tests.formats.colmap_models import random_model
 from tests.formats.sequences import encoded
 from tests.formats.test_submissions import make_submission
-from tests.fuzz import meshes, words
+from tests.fuzz import meshes
 from tests.fuzz.mutations import HOSTILE_NAMES, INT_WORDS, mutate, png_bomb, zipped
 from tests.fuzz.tree import Files, Link, pick_up, unsealed
 from tests.fuzz.worker import Reader
@@ -621,14 +621,6 @@ READERS = CAPTURES | {
     "camera path": Reader(camera_paths, read_a_camera_path, (FormatError,), cases=100),
     "stage config": Reader(stage_configs, read_a_stage, (InputError,)),
     "mesh": Reader(meshes.seeds, meshes.read, (InputError,)),
-    "command line": Reader(
-        lambda: words.seeds(runs()[0] | models()[0], splats()[0], recordings()[0]),
-        words.read,
-        (words.Refused,),
-        names_file=False,
-        make=words.make,
-        cases=60,
-    ),
 }
 """The readers that are damaged by chance."""
 
@@ -636,11 +628,5 @@ CRAFTED = {
     "transforms": Reader(hostile_transforms, posed(read_transforms), (FormatError,)),
     "colmap": Reader(hostile_models, posed(read_colmap), (FormatError,)),
     "mesh": Reader(meshes.crafted, meshes.read, (InputError,)),
-    "command line": Reader(
-        lambda: words.crafted(READERS["command line"].seeds()[0]),
-        words.read,
-        (words.Refused,),
-        names_file=False,
-    ),
 }
 """Cases that chance does not find."""

@@ -1,16 +1,18 @@
 """The process that reads hostile files: `python -m tests.fuzz.worker FOLDER`.
 
-For every line that it is sent, {"table": "READERS", "reader": name, "case": number}, it answers two
-lines of JSON: what the case is, once it lies on the disk, and what became of it. Number -1 is the
-first seed itself, -2 the second. The table "BOMBS" holds meshes that would unpack to gigabytes.
-What kills this process kills nothing else.
+For every line that it is sent, {"table": "READERS", "reader": name, "count": number}, it answers
+with one: what failed, and how many cases were read or refused. The table "BOMBS" holds meshes that
+would unpack to gigabytes. What kills this process kills nothing else: its standard error names
+the case.
 """
 
 import contextlib
+import faulthandler
 import importlib
 import json
 import os
 import resource
+import signal
 import sys
 import traceback
 import zlib
@@ -26,6 +28,9 @@ from tests.fuzz.tree import Files, lay_out
 
 MEMORY = 1 << 30
 """What one case may add at most [bytes]; a bomb that asks for more address space fails at once."""
+
+HANG = 10.0
+"""A case that takes longer hangs [s]."""
 
 _LONGEST_MESSAGE = 2000
 """A message that quotes half the file helps nobody [characters]."""
@@ -43,9 +48,6 @@ class Reader:
 
     errors: tuple[type[BaseException], ...]
     """The reader's own errors, exactly these types."""
-
-    names_file: bool = True
-    """Whether the message must name a file below the folder."""
 
     make: Callable[[np.random.Generator, Files], tuple[Files, str]] = mutate
     """Makes a case from a seed."""
@@ -126,11 +128,15 @@ def run_case(reader: Reader, folder: Path, guard: Guard) -> tuple[str, str]:
     before, peak = _resident(), _peak()
     guard.problems.clear()
     guard.active = True
+    signal.setitimer(signal.ITIMER_REAL, HANG)
+    faulthandler.dump_traceback_later(6 * HANG, exit=True)  # where no signal is handled
     try:
         reader.read(folder)
         verdict, why = "read", ""
     except BaseException as error:  # SystemExit and whatever else a library may raise
         verdict, why = _judge(reader, folder, error)
+    signal.setitimer(signal.ITIMER_REAL, 0.0)
+    faulthandler.cancel_dump_traceback_later()
     guard.active = False
     if guard.problems:
         return "failed", "; ".join(guard.problems[:3])
@@ -145,7 +151,7 @@ def _judge(reader: Reader, folder: Path, error: BaseException) -> tuple[str, str
     if type(error) not in reader.errors:
         return "failed", "".join(traceback.format_exception(error))[-1500:]
     text = str(error)
-    if reader.names_file and os.fspath(folder) not in text:
+    if os.fspath(folder) not in text:
         return "failed", f"the message names no file: {text[:500]}"
     if len(text) > _LONGEST_MESSAGE:
         return "failed", f"the message has {len(text)} characters: {text[:300]}"
@@ -172,22 +178,48 @@ def _peak() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
-def _limit_memory() -> None:
-    """What a reader asks for beyond all measure fails at once and leaves the machine alone."""
-    limit = _mapped() + 3 * MEMORY
-    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-
-
 @contextlib.contextmanager
-def _under(ceiling: int | None) -> Iterator[None]:
+def _under(ceiling: int) -> Iterator[None]:
     """Lets the process grow by so much and no further [bytes]."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    if ceiling is not None:
-        resource.setrlimit(resource.RLIMIT_AS, (_mapped() + ceiling, hard))
+    resource.setrlimit(resource.RLIMIT_AS, (_mapped() + ceiling, hard))
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+def check(table: str, name: str, count: int | None, folder: Path, guard: Guard) -> dict[str, Any]:
+    """Reads the good files of a reader, then damaged ones, or those of another table."""
+    reader, seeds = find_reader("READERS", name)
+    for number, files in enumerate(seeds):  # also imports and compiles what the reader needs
+        lay_out(folder, files)
+        reader.read(folder)
+        print(f"{name}: seed {number} is read", file=sys.stderr, flush=True)
+    if table == "READERS":
+        cases = (make_case(name, reader, seeds, n) for n in range(count or reader.cases))
+    else:
+        reader, seeds = find_reader(table, name)
+        cases = ((files, "made by hand") for files in seeds)
+    found: dict[str, Any] = {"failures": [], "read": 0, "refused": 0}
+    for number, (files, what) in enumerate(cases):
+        lay_out(folder, files)
+        print(f"{name}: case {number} ({what})", file=sys.stderr, flush=True)
+        with _under(MEMORY if table == "BOMBS" else 3 * MEMORY):
+            verdict, why = run_case(reader, folder, guard)
+        if verdict == "failed":
+            found["failures"].append(f"case {number} ({what}): {why}")
+        else:
+            found[verdict] += 1
+    return found
+
+
+class Hang(BaseException):
+    """Raised in a case that takes too long; no reader may make another error of it."""
+
+
+def _hang(*_: object) -> None:
+    raise Hang(f"for more than {HANG} s")
 
 
 def main() -> None:
@@ -197,29 +229,14 @@ def main() -> None:
     (scratch / "outside" / "secret").write_bytes(b"this is none of your business " * 40)
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # whatever libraries print is no answer
-    guard = Guard(scratch / "case")
-    known: dict[tuple[str, str], tuple[Reader, list[Files]]] = {}
-    folder = scratch / "case"
+    guard, folder = Guard(scratch / "case"), scratch / "case"
     folder.mkdir(exist_ok=True)
     os.chdir(scratch)
+    signal.signal(signal.SIGALRM, _hang)
     for line in sys.stdin:
         asked = json.loads(line)
-        key, number = (asked["table"], asked["reader"]), asked["case"]
-        if key not in known:
-            known[key] = find_reader(*key)
-        reader, seeds = known[key]
-        if number < 0:
-            files, what = seeds[-1 - number], "the seed itself"
-        else:
-            files, what = make_case(key[1], reader, seeds, number)
-        lay_out(folder, files)
-        if number >= 0 and resource.getrlimit(resource.RLIMIT_AS)[0] == resource.RLIM_INFINITY:
-            _limit_memory()
-        told = {"what": what, "seeds": len(seeds), "cases": reader.cases}
-        print(json.dumps(told), file=answers, flush=True)
-        with _under(MEMORY if key[0] == "BOMBS" else None):
-            verdict, why = run_case(reader, folder, guard)
-        print(json.dumps({"verdict": verdict, "why": why}), file=answers, flush=True)
+        found = check(asked["table"], asked["reader"], asked["count"], folder, guard)
+        print(json.dumps(found), file=answers, flush=True)
 
 
 if __name__ == "__main__":
