@@ -117,7 +117,8 @@ def fork_run(
     # To decide again, a policy needs its earlier map, which frames of a merged run or a team do not
     # give.
     is_alone = not (run.header.is_merged or run.header.is_of_team)
-    is_same = is_alone and fields == run.header.policy
+    # Earlier versions also recorded the limits of a program.
+    is_same = is_alone and fields.items() <= run.header.policy.items()
     decided_from = min(_decided_from(run), at) if is_same else at
     parent: dict[str, Any] = {"forked": str(run.path), "views": at, "decided_from": decided_from}
     if not is_alone or is_decided_apart(run):

@@ -123,14 +123,9 @@ def plain_settings(settings: Any) -> Any:
 
 
 def policy_fields(policy: Policy) -> dict[str, Any]:
-    """Describes a policy for a header: its name, its settings, and the class of a plug-in.
-
-    External programs also have their limits on this system.
-    """
+    """Describes a policy for a header: its name, its settings, and the class of a plug-in."""
     fields = {"name": policy.name, "settings": settings_of(policy)}
-    if isinstance(policy, LivesOutside):
-        return fields | {"isolation": getattr(policy, "isolation", None)}
-    if policy.name not in HOMES:  # its class finds it again
+    if policy.name not in HOMES and not isinstance(policy, LivesOutside):  # its class finds it
         fields["class"] = f"{type(policy).__module__}:{type(policy).__qualname__}"
     return fields
 

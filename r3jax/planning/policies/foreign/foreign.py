@@ -111,11 +111,6 @@ class Foreign:
         """Takes the command into the name."""
         object.__setattr__(self, "name", COMMAND + self.config.command)
 
-    @property
-    def isolation(self) -> dict[str, Any]:
-        """The limits that hold; None: no limit."""
-        return {"memory_gib": self.config.memory or None}
-
     def init(self, camera: Camera, grid: OccupancyGrid, *, key: Array) -> PlannerState:
         """Starts the program and sends `hello`.
 
