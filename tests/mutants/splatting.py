@@ -5,12 +5,12 @@ from tests.mutants import faults
 MUTANTS = [
     *faults(
         "r3jax/kernels/splatting/project.py",
-        "tests/splatting/backends/test_numba_faults.py::test_the_laws_hold[gradients_agree]",
+        "tests/splatting/backends/test_agreement.py::test_solid_clouds_agree[numba]",
         ("- _8 * _U * yz * g[11]", "+ _8 * _U * yz * g[11]"),
     ),
     *faults(
         "r3jax/kernels/splatting/project.py",
-        "tests/splatting/backends/test_numba_faults.py::test_the_laws_hold[images_agree]",
+        "tests/splatting/backends/test_agreement.py::test_solid_clouds_agree[numba]",
         ("axes[2] * axes[2] + DILATION", "axes[2] * axes[2]"),
         ("min(max(ratio, low), high)", "ratio"),
         ("_BALL_SLACK = np.float32(1.01)", "_BALL_SLACK = np.float32(0.2)"),
@@ -18,7 +18,7 @@ MUTANTS = [
     ),
     *faults(
         "r3jax/kernels/splatting/compositing.py",
-        "tests/splatting/backends/test_numba_faults.py::test_the_laws_hold[images_agree]",
+        "tests/splatting/backends/test_agreement.py::test_solid_clouds_agree[numba]",
         ("keep_ge(alpha, alpha, ALPHA_MIN)", "alpha"),
         ("smaller(alpha, splat(ALPHA_MAX))", "alpha"),
         ("return keep_gt(before * alpha, behind, TRANSMITTANCE_MIN)", "return before * alpha"),
@@ -26,7 +26,7 @@ MUTANTS = [
     ),
     *faults(
         "r3jax/kernels/splatting/compositing.py",
-        "tests/splatting/backends/test_numba_faults.py::test_the_laws_hold[gradients_agree]",
+        "tests/splatting/backends/test_agreement.py::test_solid_clouds_agree[numba]",
         ("            return place", "            return first"),
         ("rest = load(state, PIXELS + k) - passed", "rest = load(state, PIXELS + k)"),
         ("keep_ge(keep_gt(v, weight, _ZERO), ALPHA_MAX, free)", "keep_gt(v, weight, _ZERO)"),
@@ -34,7 +34,7 @@ MUTANTS = [
     ),
     *faults(
         "r3jax/kernels/splatting/gradient.py",
-        "tests/splatting/backends/test_numba_faults.py::test_the_laws_hold[gradients_agree]",
+        "tests/splatting/backends/test_agreement.py::test_solid_clouds_agree[numba]",
         ("g_middle -= g_slope / focal", "pass"),
         ("(a - along * w) * inverse", "a * inverse"),
         ("g_view[12 + k] -= away[k]", "pass"),
@@ -80,7 +80,7 @@ MUTANTS = [
     ),
     *faults(
         "r3jax/kernels/image_loss.py",
-        "tests/splatting/training/test_kernels.py::test_laws_hold_for_the_kernels_as_python[law_loss_and_its_gradient_are_the_formulas]",
+        "tests/splatting/training/test_kernels.py::test_the_loss_and_its_gradient_are_those_of_the_formulas[size2]",
         ("mx, my = mx + wa, my + wb", "mx, my = mx + wa, my + wa"),
         ("fma(wa, b, xy)", "fma(wa, a, xy)"),
         ("inside = 0 <= y <", "inside = 0 < y <"),
@@ -98,7 +98,7 @@ MUTANTS = [
     ),
     *faults(
         "r3jax/kernels/adam.py",
-        "tests/splatting/training/test_kernels.py::test_laws_hold_for_the_kernels_as_python[law_adam_is_the_formulas]",
+        "tests/splatting/training/test_kernels.py::test_a_step_is_that_of_the_formulas",
         ("slope = load(g, k) * load(share, at)", "slope = load(g, k)"),
         ("load(m, k), _BETA1", "load(m, k), _BETA2"),
         ("slope * slope * _REST2", "slope * _REST2"),

@@ -11,9 +11,7 @@ from r3jax.kernels.native.compiled import flush_denormals, parallel_kernel
 from r3jax.splatting.scene import GaussianScene, empty_scene
 from r3jax.splatting.training import optimizer, train_step
 from r3jax.splatting.training.config import TrainConfig
-from tests.plain_kernels import Modules, kernels_as_python, load
 
-CHAIN = tuple(f"r3jax.kernels.{name}" for name in ("image_loss", "adam"))
 WEIGHT = 0.3
 SIZES = ((7, 5), (24, 20), (70, 33), (1, 1))
 """Of images: lower than the window, of whole vectors, of several bands, a pixel."""
@@ -38,20 +36,6 @@ def loss_by(implementation, x, y, weight=WEIGHT):
     )
     (value, error), gradient = step(jnp.asarray(x))
     return value, error, gradient
-
-
-def kernel_of_loss(modules: Modules, x, y):
-    height = len(x)
-    results, gradient = np.empty(2, np.float32), np.empty(x.reshape(height, -1).shape, np.float32)
-    flat = (image.reshape(height, -1) for image in (x, y))
-    modules["image_loss"].loss_pass(*flat, np.float32(WEIGHT), 1, results, gradient)
-    return *results, gradient.reshape(x.shape)
-
-
-def law_loss_and_its_gradient_are_the_formulas(modules: Modules) -> None:
-    for size in ((9, 7), (35, 6)):
-        x, y = images(*size)
-        assert_same_loss(kernel_of_loss(modules, x, y), loss_by(train_step._by_formulas, x, y))
 
 
 def assert_same_loss(found, expected) -> None:
@@ -96,50 +80,12 @@ def adam_by(step, scene, gradient, degree=2, is_wanted=YES):
     return jax.jit(step)(*state, RATE, jnp.int32(degree), CONFIG, is_wanted)
 
 
-def kernel_of_adam(modules: Modules, scene, gradient, degree):
-    """`guarded_update` by the pass itself, as plain Python."""
-    moments = moments_after(scene)
-    flat = [
-        tuple(np.array(x).reshape(-1) for x in jax.tree.leaves(tree))
-        for tree in (scene, gradient, moments.mean, moments.square)
-    ]
-    sh = [CONFIG.rate_sh, CONFIG.rate_sh / 20.0]
-    rates = [RATE, CONFIG.rate_quats, CONFIG.rate_log_scales, CONFIG.rate_opacities, *sh]
-    corrections = [1.0 / (1.0 - 0.9**8), 1.0 / (1.0 - 0.999**8)]
-    row = 3 * scene.sh.shape[1]
-    options, applied = np.array([row, 3 * (degree + 1) ** 2, 1, 1]), np.zeros(1, np.int32)
-    numbers = np.array(rates, np.float32), np.array(corrections, np.float32)
-    modules["adam"].adam_pass(*flat, *numbers, options, applied)
-    put = lambda tree, arrays: jax.tree.unflatten(
-        jax.tree.structure(tree),
-        [x.reshape(y.shape) for x, y in zip(arrays, jax.tree.leaves(tree), strict=True)],
-    )
-    count = moments.count + applied[0]
-    after = optimizer.Moments(put(scene, flat[2]), put(scene, flat[3]), count)
-    return put(scene, flat[0]), after, applied[0] > 0
-
-
-def law_adam_is_the_formulas(modules: Modules) -> None:
-    scene, gradient = random_scene(0, rows=11), random_scene(1, 0.1, rows=11)
-    found = kernel_of_adam(modules, scene, gradient, 1)
-    assert_same_step(found, adam_by(optimizer._by_formulas, scene, gradient, 1))
-
-
 def assert_same_step(found, expected) -> None:
     """To rounding: parameters near 1 resolve 6e-8."""
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-6, atol=1e-7), *(
         (step[0], step[1].mean, step[1].square, step[1].count, step[2])
         for step in (found, expected)
     ))  # fmt: skip
-
-
-LAWS = [law_loss_and_its_gradient_are_the_formulas, law_adam_is_the_formulas]
-
-
-@pytest.mark.parametrize("law", LAWS)
-def test_laws_hold_for_the_kernels_as_python(law):
-    with kernels_as_python():
-        law(load(CHAIN))
 
 
 @pytest.mark.parametrize(("rows", "degree"), [(50, 2), (7, 0), (3000, 3)])
