@@ -270,6 +270,10 @@ def _write_transforms(
         name = _image_name(source, index)
         frame = {"file_path": f"images/{name}", **_lens_fields(lens)}
         _take_image(source, index, frame["file_path"], files)
+        if isinstance(source, PosedImages) and source.photo_of is not None:
+            # nerfstudio takes masks of all frames or of none.
+            frame["mask_path"] = f"masks/{Path(name).stem}.png"
+            files.write(frame["mask_path"], _mask_png(source.masked_rgb(index)[1], lens))
         if has_depth:
             depth = _depth(source, index)
             depth = np.zeros((lens.height, lens.width)) if depth is None else depth
@@ -311,6 +315,16 @@ def _depth(source: Run | PosedImages, index: int) -> np.ndarray | None:
     if isinstance(source, Run):
         return np.asarray(source.frame(source.rows[index].step).depth)
     return source.depth(index)
+
+
+def _mask_png(mask: np.ndarray | None, lens: Lens) -> bytes:
+    """Encodes a mask as PNG: white where the pixels of an image count."""
+    gray = np.full((lens.height, lens.width), 255, np.uint8)
+    if mask is not None:
+        gray[~mask] = 0
+    buffer = io.BytesIO()
+    Image.fromarray(gray).save(buffer, format="png")
+    return buffer.getvalue()
 
 
 def _depth_png(depth: np.ndarray) -> bytes:
