@@ -19,9 +19,8 @@ from PIL import Image
 
 import r3jax
 from docs.figures.stills import Sheet, Squares, compose, draw, lines, overview
-from r3jax.apps.viewer.blocks import block_colors, cut_height, known_at, scoring_of
-from r3jax.apps.viewer.pictures import frustum_segments, path_segments
-from r3jax.apps.viewer.story import Timeline
+from r3jax.apps.viewer.drawing import block_colors, frustum_segments, known_at, path_segments
+from r3jax.apps.viewer.story import Timeline, cut_height, scoring_of
 from r3jax.runs.reader import Run, read_run
 
 WIDTH, HEIGHT = 960, 600

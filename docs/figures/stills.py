@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
-from r3jax.apps.viewer.blocks import title_of
-from r3jax.apps.viewer.pictures import SCORES, UNSEEN, paint
+from r3jax.apps.viewer.drawing import SCORES, UNSEEN, paint
+from r3jax.apps.viewer.story import title_of
 from r3jax.geometry.cameras import Camera, look_at
 from r3jax.runs.reader import Run
 

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from r3jax.apps.viewer.blocks import CAUSE
-from r3jax.apps.viewer.pictures import (
+from r3jax.apps.viewer.drawing import (
+    CAUSE,
     ORDER,
     SCORES,
     TERMS,
@@ -59,10 +59,10 @@ HINTS = {
     "unexplored cells": "U_G: cells of the coarse grid in view that no view has shown yet.",
     "missing quality": "U_R: the sum of 1 - R over the voxels in view. A view from here "
     "would improve much if it is high.",
-    "utility this way": "Utility of looking straight ahead from here: unexplored cells (weighted "
+    "utility ahead": "Utility of the view straight ahead: unexplored cells (weighted "
     "by lambda1) plus missing quality.",
-    "utility the best way": "The same for the best direction from this position: the ring in the "
-    "picture below, and the red arrow in the scene.",
+    "utility, best direction": "The same for the best direction from this position: the ring in "
+    "the picture below, and the red arrow in the scene.",
     # Candidates and causes.
     "candidates": "Poses that the planner could choose from, best score first. Score = share of "
     "the utility minus lambda2 times share of the path.",
@@ -96,22 +96,22 @@ class Layer:
     """Name in the menu."""
 
     surface: str
-    """What is drawn: voxels, splats, points or mesh."""
+    """Surface that is drawn: voxels, splats, points or mesh."""
 
     quantity: str
-    """What it is colored by: one of `blocks.QUANTITIES`, or `CAUSE`."""
+    """Quantity that gives the colors: one of `drawing.QUANTITIES`, or `CAUSE`."""
 
     title: str
-    """What the legend says of it."""
+    """Title in the legend."""
 
     @property
     def has_score(self) -> bool:
-        """Whether the colors are those of R or of a term, which depend on a place."""
+        """True if the colors are those of R or of a term, which depend on a position."""
         return self.quantity not in ("color", CAUSE)
 
     @property
     def is_of_one_view(self) -> bool:
-        """Whether it shows what was known after a view; all else shows the whole run."""
+        """True if it shows the map after a view; other layers show the whole run."""
         return self.surface == "voxels"
 
 
@@ -282,7 +282,7 @@ def stale_html(content: str, text: str = "") -> str:
 
     Args:
         content: from this module.
-        text: what is being computed.
+        text: note on the current computation.
     """
     faint = content.replace('data-state="done"', 'data-state="computing"')
     return _part("stale", content=faint, text=text)
@@ -293,7 +293,7 @@ def preview_html(glance: QuickPreview, look: CameraPreview | None, view: int) ->
 
     Args:
         glance: what takes milliseconds.
-        look: the rest, once it is there.
+        look: the other numbers, once they are computed.
         view: number of the last view in the map that it is scored on, from 1.
     """
     facts = {"known surface": f"{100 * glance.seen:.0f} % of its pixels"}
@@ -301,8 +301,8 @@ def preview_html(glance: QuickPreview, look: CameraPreview | None, view: int) ->
         this, best = _utilities(look)
         facts["unexplored cells"] = f"{look.exploration:,.0f}"
         facts["missing quality"] = f"{look.rendering:,.0f}"
-        facts["utility this way"] = f"{this:,.0f}"
-        facts["utility the best way"] = f"{best:,.0f}"
+        facts["utility ahead"] = f"{this:,.0f}"
+        facts["utility, best direction"] = f"{best:,.0f}"
     terms = [
         {"name": name, "percent": f"{100.0 * value:.0f}", "color": _color(value, SCORES),
          "value": f"{value:.2f}"}
@@ -364,21 +364,21 @@ def _number(value: float | None) -> str:
 
 @dataclass(frozen=True)
 class Caption:
-    """Adds the menus that select the drawing."""
+    """Content of the legend."""
 
     layer: Layer
     moment: str
     """Such as `after view 37 of 100`."""
 
     detail: str
-    """Such as how many voxels are drawn."""
+    """A detail, such as the number of voxels."""
 
 
 def legend_html(caption: Caption, with_candidates: bool = False) -> str:
     """Formats the legend: the drawn layer, its moment, and the meaning of its colors.
 
     Args:
-        caption: what is drawn.
+        caption: the current drawing.
         with_candidates: whether the candidates of a view are drawn too.
     """
     layer = caption.layer
@@ -410,7 +410,7 @@ def _bar(name: str, low: str, high: str, hint: str) -> dict[str, Any]:
 
 
 def busy_html(text: str, legend: str) -> str:
-    """Formats a note on the current computation, above the legend of what is drawn until then.
+    """Formats a note on the current computation, above the legend of the current drawing.
 
     The legend is empty if nothing is drawn yet.
     """

@@ -18,18 +18,19 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from PIL import Image
 
-from r3jax.apps.viewer.blocks import (
+from r3jax.apps.viewer.drawing import (
     QUANTITIES,
+    SCORES,
+    UNSEEN,
     Known,
     block_colors,
-    cut_height,
+    css_color,
+    frustum_segments,
     known_at,
-    scoring_of,
-    title_of,
+    path_segments,
 )
 from r3jax.apps.viewer.facts import facts_of_view
-from r3jax.apps.viewer.pictures import SCORES, UNSEEN, css_color, frustum_segments, path_segments
-from r3jax.apps.viewer.story import Timeline
+from r3jax.apps.viewer.story import Timeline, cut_height, scoring_of, title_of
 from r3jax.exploration.taken_views import unit_of
 from r3jax.files import check_vacant, make_folder, whole_folder, write_atomic
 from r3jax.formats.errors import FormatError
@@ -63,17 +64,17 @@ BUDGET = 200_000
 """Blocks in a picture at most."""
 
 SCENE = (0.0, 0.08, 0.74, 0.80)
-"""Where the map stands in a picture: left, bottom, width, height, as shares of it."""
+"""Position of the map in a picture: left, bottom, width, height, as shares of it."""
 
 _RIGHT, _SIDE = 0.76, 0.22
 """Left edge and width of the column beside it."""
 
 _DPI = 100
 _TURN = 24.0
-"""How far the film goes round the place [deg]."""
+"""Angle by which the film circles the place [deg]."""
 
 _LAST_FOR = 2.0
-"""How long the film stays on its last picture [s]."""
+"""Duration of the last picture [s]."""
 
 _COVER = 1.3
 """Width of a drawn block over its edge: seen at an angle a cube covers more than one side."""
@@ -224,7 +225,7 @@ def export_film(
         run: with at least one view.
         out: a folder that does not exist yet, or is empty. It is complete or not there.
         video: write `run.mp4` too.
-        on_picture: told how many pictures are done, and how many there will be.
+        on_picture: called with the number of pictures done and in total.
 
     Returns:
         What was written: the stills, the folder of the pictures, the film.

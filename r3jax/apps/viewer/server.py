@@ -1,4 +1,4 @@
-"""The web server of the viewer: on this machine only, for its own page only, unless told otherwise.
+"""The web server of the viewer: by default for this machine and its own page only.
 
 A browser lets any web page open a websocket to any address, this machine's too; and a page may
 give its own name this machine's address (DNS rebinding). So every request says two things that are
@@ -28,7 +28,7 @@ class _PrivateServer(viser.ViserServer):
     """Never opens a tunnel to the internet, even on a page's request."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """Declines."""
+        """Declines the request."""
         del verbose
         return None
 
@@ -50,7 +50,10 @@ def open_server(host: str, port: int, allow: Collection[str] = ()) -> viser.Vise
     # It would print a box of its own.
     with contextlib.redirect_stdout(io.StringIO()), _guarded(_Guard(host, allow)):
         server = _PrivateServer(host=host, port=port, label="r3jax", verbose=False)
-    if port not in (0, server.get_port()):  # taken meanwhile: it has gone on to the next one
+    if port not in (
+        0,
+        server.get_port(),
+    ):  # it was taken, and viser uses the next
         close_server(server)
         raise OSError(in_use(host, port))
     if _answer(server, f"{_STRANGER}:1") != http.HTTPStatus.FORBIDDEN:
@@ -65,7 +68,7 @@ _Hook = Callable[[ServerConnection, Request], Any]
 
 
 class _Guard:
-    """Which requests are answered."""
+    """Decides which requests are allowed."""
 
     def __init__(self, host: str, allow: Collection[str]):
         """Takes the address to listen at, and the names that are let in beside it."""
@@ -81,7 +84,7 @@ class _Guard:
         if len(hosts) != 1 or len(origins) > 1:
             return "one Host and at most one Origin"
         name = _name(f"http://{hosts[0]}")
-        # Who listens for others is asked by its address too, and no page can own an address.
+        # A public server is also requested by its address, and no page can own an address.
         if name not in self._names and not (self._is_open and _is_address(name)):
             return f"not served as {name!r}: r3jax view --allow {name}"
         if not origins or urlsplit(origins[0]).netloc.lower() == hosts[0].lower():
@@ -90,7 +93,7 @@ class _Guard:
         return None if page in self._allowed else f"pages of {page!r} may not: --allow {page}"
 
     def hook(self, answer: _Hook | None) -> _Hook:
-        """Asked before every answer, of pages and of websockets."""
+        """Returns a hook that checks every request, of pages and of websockets."""
 
         def process(connection: ServerConnection, request: Request) -> Response | None:
             reason = self.refusal(request)

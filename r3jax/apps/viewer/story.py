@@ -1,4 +1,4 @@
-"""A run as the viewer sees it: recorded, or still going on.
+"""A run for the viewer: recorded, or in progress.
 
 The map and the grid of a recorded run after any of its views are rebuilt from the frames, one after
 the other. Some states on the path are kept, as many as fit in a given memory and evenly spaced, so
@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from r3jax.apps.viewer.pictures import UTILITY_MAP, frustum_segments, paint, spread
 from r3jax.exploration.config import ExplorationConfig, parse_budget
 from r3jax.exploration.guard import GuardedSimulator
 from r3jax.exploration.state import Mission, model_clock
@@ -29,10 +29,11 @@ from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.planning.planner import Planner, add_frame, first_map
 from r3jax.planning.policy import Decision, Policy
-from r3jax.runs.header import RunError
+from r3jax.runs.header import RunError, RunHeader
 from r3jax.runs.reader import Run
 from r3jax.runs.replay import Reason, check_decided_alone, explain_run, grid_before
 from r3jax.runs.settings import config_of
+from r3jax.scoring.config import ScoringConfig
 
 
 @dataclass(frozen=True)
@@ -46,31 +47,13 @@ class Offer:
     """Per candidate, [C] each; `total` and `path` always."""
 
     chosen: int
-    """Which of them was taken."""
+    """Index of the chosen one."""
 
 
 def offer_of(decision: Decision) -> Offer:
     """Returns the candidates of a decision, and which of them was chosen."""
     gap = np.abs(decision.candidates - decision.T_world_camera).max(axis=(1, 2))
     return Offer(decision.candidates, decision.utilities, int(np.argmin(gap)))
-
-
-def offer_segments(camera: Camera, offer: Offer) -> tuple[np.ndarray, np.ndarray]:
-    """Draws candidates as frusta, the chosen one larger; yellow is best, gray is out of reach.
-
-    Returns:
-        Ends [s, 2, 3] float32 [m] and colors [s, 2, 3] uint8.
-    """
-    is_reachable = np.isfinite(offer.utilities["path"])
-    scores = spread(np.where(is_reachable, offer.utilities["total"], np.nan))
-    parts = [
-        frustum_segments(camera, np.asarray(pose), 0.2 if number == offer.chosen else 0.1)
-        for number, pose in enumerate(offer.poses)
-    ]
-    if not parts:
-        return np.zeros((0, 2, 3), np.float32), np.zeros((0, 2, 3), np.uint8)
-    colors = np.repeat(paint(scores, UTILITY_MAP), len(parts[0]), axis=0)
-    return np.concatenate(parts), np.repeat(colors[:, None], 2, axis=1)
 
 
 @dataclass(frozen=True)
@@ -146,12 +129,12 @@ def decide_again(
 
 
 MEMORY = 128 << 20
-"""What kept states may take [bytes]."""
+"""Memory for stored states [bytes]."""
 
 
 @dataclass(frozen=True)
 class Moment:
-    """What was known after a view."""
+    """Map and grid after a view."""
 
     step: int
     """Number of the view; -1 before the first."""
@@ -171,7 +154,7 @@ def why_no_choice(row: StepRow) -> str:
         return "captured while moving"
     if row.begins_run:
         return "the start: nothing was chosen"
-    return "the view at the end of a path: the choice is shown with the first frame of the path"
+    return "taken on arrival: the decision to come here is shown with the first frame of this path"
 
 
 class Timeline:
@@ -417,7 +400,7 @@ class RecordedStory:
 
 
 class LiveStory:
-    """A run that is going on. Of the map only the newest state is kept."""
+    """A run in progress. Only the newest state of the map is stored."""
 
     is_live = True
 
@@ -430,7 +413,7 @@ class LiveStory:
 
         Args:
             camera: of every view.
-            earlier: the run that is gone on with.
+            earlier: recording of a resumed run.
         """
         self._camera, self._earlier = camera, earlier
         self._rows: list[StepRow] = [] if earlier is None else list(earlier.rows)
@@ -506,3 +489,35 @@ class LiveStory:
 
 def _recorded_image(run: Run, step: int) -> np.ndarray:
     return run.images(step)[0]
+
+
+_ABOVE_HEADS = 0.6
+
+
+_BELOW_CEILING = 0.3
+
+
+def scoring_of(header: RunHeader) -> ScoringConfig:
+    """Returns the settings of the scores, with the range of the run's sensor."""
+    max_range = float(header.config.get("max_range", 5.0))
+    return ScoringConfig(max_range=jnp.asarray(max_range, dtype=jnp.float32))
+
+
+def title_of(header: RunHeader) -> str:
+    """Names a run by its policy and its scene; of a file, without its folders."""
+    scene = str(header.scene.get("name", "")).rpartition("/")[2]
+    return f"{header.policy.get('name', '')} in {scene}"
+
+
+def cut_height(rows: Sequence[StepRow], points: np.ndarray) -> float:
+    """Returns the height [m] above which nothing is drawn, so that the place is open from above.
+
+    Args:
+        rows: of the trace, at least one: the cameras stay in view.
+        points: centers of blocks [n, 3] [m].
+    """
+    typical = float(np.median([row.pose[2, 3] for row in rows])) + _ABOVE_HEADS
+    if len(points) == 0:
+        return typical
+    # Below the ceiling in any case, even where the cameras flew right under it.
+    return min(typical, float(np.percentile(points[:, 2], 99.5)) - _BELOW_CEILING)

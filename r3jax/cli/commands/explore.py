@@ -115,7 +115,7 @@ def _open_page(options: PageOptions, stack: contextlib.ExitStack) -> Callable[[E
         OSError: the port is in use.
     """
     check_viser()
-    from r3jax.apps.viewer.pages import open_live
+    from r3jax.apps.viewer.run_page import open_live
     from r3jax.apps.viewer.server import close_server, open_server
 
     server = open_server("127.0.0.1", options.port)

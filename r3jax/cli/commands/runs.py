@@ -302,7 +302,7 @@ def _run_page(options: ViewOptions, run: Run) -> contextlib.AbstractContextManag
         InputError: viser is not installed.
     """
     check_viser()
-    from r3jax.apps.viewer.pages import open_run_page  # needs viser
+    from r3jax.apps.viewer.run_page import open_run_page  # needs viser
 
     return open_run_page(
         run,
@@ -322,7 +322,7 @@ def _scan_page(options: ViewOptions) -> contextlib.AbstractContextManager[_Page]
         ValueError, OSError: neither of them, or a damaged one.
     """
     check_viser()
-    from r3jax.apps.viewer.scan import open_scan_page, scan_of  # needs viser
+    from r3jax.apps.viewer.scan_page import open_scan_page, scan_of  # needs viser
 
     return open_scan_page(
         scan_of(options.path), host=options.host, port=options.port, allow=options.allow

@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import r3jax
-from r3jax.apps.viewer.blocks import (
+from r3jax.apps.viewer.drawing import (
     QUANTITIES,
+    UNSEEN,
     SurfaceTerms,
     block_colors,
     block_values,
@@ -19,7 +20,6 @@ from r3jax.apps.viewer.blocks import (
     probe_positions,
     surface_terms,
 )
-from r3jax.apps.viewer.pictures import UNSEEN
 from r3jax.apps.viewer.story import Timeline
 from r3jax.geometry.voxels import INDEX_LIMIT
 from r3jax.mapping.seen import visible_rows

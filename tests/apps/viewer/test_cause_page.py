@@ -8,10 +8,9 @@ import pytest
 
 pytest.importorskip("viser", reason="the viewer needs viser, which is not installed")
 
-from r3jax.apps.viewer.blocks import CAUSE
+from r3jax.apps.viewer.drawing import CAUSE, CAUSE_COLORS, UNSEEN
 from r3jax.apps.viewer.facts import LAYERS
-from r3jax.apps.viewer.pages import open_run_page
-from r3jax.apps.viewer.pictures import CAUSE_COLORS, UNSEEN
+from r3jax.apps.viewer.run_page import open_run_page
 from r3jax.runs.replay import explain_run
 from tests.apps.viewer.conftest import VIEWS
 

@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from r3jax.apps.viewer.story import decide_again, offer_segments
+from r3jax.apps.viewer.drawing import offer_segments
+from r3jax.apps.viewer.story import decide_again
 from r3jax.planning.registry import make_policy
 from r3jax.runs.header import RunError
 from r3jax.runs.settings import settings_of_run

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from r3jax.apps.viewer.blocks import CAUSE
+from r3jax.apps.viewer.drawing import CAUSE, ORDER, SCORES, UNSEEN, UTILITY_MAP, css_color, paint
 from r3jax.apps.viewer.facts import (
     HINTS,
     LAYERS,
@@ -27,7 +27,6 @@ from r3jax.apps.viewer.facts import (
     stale_html,
     view_html,
 )
-from r3jax.apps.viewer.pictures import ORDER, SCORES, UNSEEN, UTILITY_MAP, css_color, paint
 from r3jax.exploration.taken_views import Choice, Coverage, StepRow
 from r3jax.plots.style import CAUSE_COLORS
 from r3jax.runs.replay import Reason

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from r3jax.apps.viewer.blocks import QUANTITIES, cut_height
+from r3jax.apps.viewer.drawing import QUANTITIES
 from r3jax.apps.viewer.film import HEIGHT, SCENE, WIDTH, export_film
+from r3jax.apps.viewer.story import cut_height
 from r3jax.runs.header import RunError
 from r3jax.runs.reader import read_run
 from tests.apps.viewer.conftest import VIEWS

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from r3jax.apps.viewer import pages
-from r3jax.apps.viewer.pages import world_glb
+from r3jax.apps.viewer import run_page as pages
+from r3jax.apps.viewer.run_page import world_glb
 from r3jax.simulators.world import Material, World
 
 TEXTURE = np.zeros((2, 2, 3), np.uint8)

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("viser", reason="the viewer needs viser, which is not installed")
 
-from r3jax.apps.viewer.pages import open_live
+from r3jax.apps.viewer.run_page import open_live
 from r3jax.apps.viewer.server import close_server, open_server
 from r3jax.apps.viewer.story import LiveStory
 from r3jax.exploration.loop import explore

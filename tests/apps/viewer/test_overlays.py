@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r3jax.apps.viewer.pictures import (
+from r3jax.apps.viewer.drawing import (
     frustum_corners,
     frustum_segments,
     path_segments,

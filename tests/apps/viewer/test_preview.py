@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import r3jax
-from r3jax.apps.viewer.pictures import (
+from r3jax.apps.viewer.drawing import (
     TERMS,
     Context,
     paint,

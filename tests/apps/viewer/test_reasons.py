@@ -5,8 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from r3jax.apps.viewer.blocks import Blocks, block_causes, cause_colors
-from r3jax.apps.viewer.pictures import UNSEEN
+from r3jax.apps.viewer.drawing import UNSEEN, Blocks, block_causes, cause_colors
 from r3jax.apps.viewer.story import RecordedStory
 from r3jax.plots import style
 from r3jax.runs.replay import Reason, explain_run

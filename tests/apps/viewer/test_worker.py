@@ -6,7 +6,7 @@ import pytest
 
 pytest.importorskip("viser", reason="the viewer needs viser, which is not installed")
 
-from r3jax.apps.viewer.app import LatestWorker
+from r3jax.apps.viewer.run_page import LatestWorker
 
 PATIENCE = 30.0  # seconds after which a test gives up
 

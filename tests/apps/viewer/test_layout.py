@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 pytest.importorskip("viser", reason="the viewer needs viser, which is not installed")
 
-from r3jax.apps.viewer.canvas import framing
-from r3jax.apps.viewer.queries import floor_height
+from r3jax.apps.viewer.layout import framing
+from r3jax.apps.viewer.run_page import floor_height
 from r3jax.geometry.cameras import look_at
 
 FIELD_OF_VIEW = np.deg2rad(35.0)  # of the page, vertical

@@ -13,7 +13,7 @@ pytest.importorskip("viser", reason="the viewer needs viser, which is not instal
 from r3jax.apps.audit.audit import audit
 from r3jax.apps.audit.outputs import write_outputs
 from r3jax.apps.audit.settings import AuditSettings
-from r3jax.apps.viewer.scan import answer, open_scan_page, picked, scan_of, sentences
+from r3jax.apps.viewer.scan_page import answer, open_scan_page, picked, scan_of, sentences
 from r3jax.captures import capture_maps
 from r3jax.captures.source import source_of
 from r3jax.errors import InputError

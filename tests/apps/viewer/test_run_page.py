@@ -20,8 +20,7 @@ pytest.importorskip(
 from playwright import sync_api
 from viser import transforms
 
-from r3jax.apps.viewer.pages import open_run_page
-from r3jax.apps.viewer.queries import Query
+from r3jax.apps.viewer.run_page import Query, open_run_page
 from tests.apps.viewer.conftest import VIEWS
 
 CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"

@@ -1,6 +1,6 @@
-"""The page of a scan: surfaces by what an audit found, its pictures, views to add, and its splat.
+"""The page of a scan: surfaces by renderability or cause, pictures, views to add, and a splat.
 
-A click on a surface answers which pictures see it and what it still needs. An audit is read from
+A click on a surface shows which pictures see it and what it still needs. An audit is read from
 its folder; a recording without one is mapped, and shows surfaces in their colors only.
 
 Everything is in the audit's coordinates: z up, about a meter to the unit.
@@ -10,9 +10,10 @@ Shape symbols: m voxels; n pictures; k suggested views.
 
 import contextlib
 import functools
+import shlex
 import threading
 from collections.abc import Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,16 @@ import viser
 from PIL import Image, ImageDraw
 from scipy.spatial import KDTree
 
-from r3jax.apps.viewer.canvas import framing
-from r3jax.apps.viewer.panel import PANEL_WIDTH
-from r3jax.apps.viewer.pictures import paint, quaternion, splat_arrays, to_bytes
+from r3jax.apps.viewer.drawing import (
+    SCORES,
+    UNSEEN,
+    css_color,
+    paint,
+    quaternion,
+    splat_arrays,
+    to_bytes,
+)
+from r3jax.apps.viewer.layout import dock_panel, place_eye
 from r3jax.apps.viewer.server import close_server, open_server, url_of
 from r3jax.captures.alignment import Alignment
 from r3jax.captures.capture_maps import grown
@@ -47,14 +55,14 @@ _MAX_BYTES = 1 << 26
 _CAPACITY = 1 << 15
 
 _SPREAD = 0.75
-"""A click meets a voxel whose center is within this of its ray [voxels]."""
+"""Maximum distance of a voxel's center from the ray of a click [voxels]."""
 
 _BLOCKS, _SHORT = 0.55, 2.5
-"""A line of sight is blocked by a voxel whose center is so near to it; not so short of its end,
-where a wall may be several voxels thick [voxels]."""
+"""A line of sight is blocked by voxels with centers within the first distance from it, but not
+within the second from its end, as a wall may be several voxels thick [voxels]."""
 
 _SHOWN = 3
-"""Pictures beside an answer."""
+"""Maximum number of pictures shown for a click."""
 
 _SIDE = 300
 """Longer side of such a picture [px]."""
@@ -63,39 +71,63 @@ _THUMBNAIL = 64
 """Width of the pictures in the frusta [px]."""
 
 _MOST_FRUSTA = 150
-"""Pictures whose cameras are drawn, evenly spread."""
+"""Maximum number of cameras drawn, evenly spread."""
 
 _HEADROOM = 0.35
-"""What lies higher above the cameras is hidden at first: the ceiling [audit units]."""
+"""Height above the cameras at which the drawing is cut at first [audit units]."""
 
 _NEAREST = 0.05
-"""What is nearer to a camera is not in its picture [audit units]."""
+"""Minimum distance of a point in a picture from its camera [audit units]."""
 
 _PICTURE, _SUGGESTED = (120, 124, 134), (14, 116, 204)
 
 _ASIDE = 1.1
-"""The splat stands beside the surfaces, this many of their widths away."""
+"""Distance of the splat from the surfaces beside it, in their widths."""
+
+_CUTS = 60
+"""Approximate number of heights at which the drawing can be cut."""
+
+_LABEL_AHEAD = 0.25
+"""Distance of a suggested view's number from its position [audit units]."""
+
+_STOPS = 12
+"""Colors of the bar in the legend."""
+
+_R_HINT = (
+    "Renderability R: how well a picture of this surface could be rendered from the captured ones. "
+    "0 is not at all, 1 is perfect."
+)
+_LAYER_HINT = (
+    "Renderability: how well each surface would render. Cause: why it would not. Colors: those of "
+    "the pictures."
+)
+_CUT_HINT = "Height above the floor. Nothing above it is drawn, so that you look into the rooms."
+_UNITS = {"m": "In meters.", "u": "In the units of the file, which may not be meters."}
+_PICTURES_HINT = "Draws a small camera for each picture; a click on one shows the picture."
 
 
 @dataclass(frozen=True)
 class Scan:
-    """What is shown of a scan."""
+    """Content of the page."""
 
     title: str
 
     lead: str
     """A sentence below the title."""
 
-    centers: np.ndarray
-    """Voxels, [m, 3]."""
+    command: str = ""
+    """A command that says more, if there is one."""
 
-    edge: float
-    """Of a voxel."""
+    centers: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    """Centers of the voxels, [m, 3]."""
 
-    layers: dict[str, np.ndarray]
-    """Colors of the voxels, [m, 3] uint8, by what they show."""
+    edge: float = 0.01
+    """Voxel size."""
 
-    poses: np.ndarray
+    layers: dict[str, np.ndarray] = field(default_factory=dict[str, np.ndarray])
+    """Colors of the voxels, [m, 3] uint8, by the quantity that they show."""
+
+    poses: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))
     """`T_world_camera` of the pictures, [n, 4, 4]; none where the capture is gone."""
 
     meter: float = 1.0
@@ -127,7 +159,7 @@ class Scan:
 
 @dataclass(frozen=True)
 class Answer:
-    """What is known of a place that was clicked."""
+    """Pictures and suggested views that see a clicked place."""
 
     row: int
     """The voxel."""
@@ -192,7 +224,7 @@ def read_audit(folder: Path) -> Scan:
         centers=alignment.points(xyz),
         edge=edge,
         layers={"renderability": paint(value), "cause": colors},
-        poses=np.zeros((0, 4, 4)) if source is None else alignment.poses(source.poses),
+        poses=alignment.poses(np.zeros((0, 4, 4)) if source is None else source.poses),
         meter=alignment.scale,
         unit=unit,
         facts=facts,
@@ -228,7 +260,8 @@ def map_recording(path: Path) -> Scan:
     colors = to_bytes(np.asarray(state.mean).T)
     return Scan(
         title=capture.name,
-        lead=f"{len(source)} pictures. What they miss: r3jax audit {path}",
+        lead=f"{len(source)} pictures. An audit says what they miss:",
+        command=f"r3jax audit {shlex.quote(str(path))}",
         centers=np.asarray(state.center, np.float64).T[present],
         edge=survey.voxel_size,
         layers={"colors": colors[present]},
@@ -251,9 +284,7 @@ def splats_alone(path: Path) -> Scan:
         title=path.name,
         lead=f"{int(np.asarray(scene.is_alive).sum())} Gaussians.",
         centers=centers,
-        edge=0.01,
-        layers={},
-        poses=np.zeros((0, 4, 4)),
+        unit="u",
         splats=scene,
     )
 
@@ -265,7 +296,7 @@ def picked(scan: Scan, origin: np.ndarray, direction: np.ndarray, top: float) ->
         scan: its voxels.
         origin: of the ray, [3].
         direction: of any length, [3].
-        top: what is higher is hidden.
+        top: height of the cut.
     """
     offset = scan.centers - origin
     ahead = direction / np.linalg.norm(direction)
@@ -309,7 +340,7 @@ def _shows(scan: Scan, picture: int | None, pose: np.ndarray, point: np.ndarray)
 
 
 def sentences(scan: Scan, found: Answer) -> list[str]:
-    """Says what is known of a place, and what to do about it."""
+    """Describes a clicked place, and how to improve it."""
     texts: list[str] = []
     if scan.facts is not None:
         fact = scan.facts[found.row]
@@ -371,30 +402,27 @@ class ScanPage:
 
         Args:
             server: with an empty page.
-            scan: what is shown.
+            scan: content of the page.
         """
         self.url = url_of(server)
         self.scan = scan
         self._server, self._lock = server, threading.Lock()
         gui = server.gui
-        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(15, 118, 110))
-        gui.set_panel_label(scan.title)
-        gui.main_panel.dock_right()  # beside the scene, which is never under it
-        gui.main_panel.set_width(PANEL_WIDTH)
-        gui.add_html(self._html("head", lead=scan.lead))
-        lowest, highest = (float(z) for z in np.percentile(scan.centers[:, 2], [0.0, 100.0]))
-        top = highest
-        if len(scan.poses):
-            top = min(top, float(np.median(scan.poses[:, 2, 3])) + _HEADROOM)
-        names = tuple(scan.layers) or ("nothing",)
-        self._layer = gui.add_dropdown("surfaces by", names, visible=bool(scan.layers))
-        step = max((highest - lowest) / 200.0, 1e-6)
-        self._top = gui.add_slider("hide above", lowest, highest + step, step, max(top, lowest))
-        self._frusta = gui.add_checkbox("pictures", True, visible=bool(len(scan.poses)))
+        dock_panel(server, scan.title)
+        gui.add_html(self._html("head", lead=scan.lead, command=scan.command))
         low, high = np.percentile(scan.centers, [1.0, 99.0], axis=0)
         self._box = low, high
         self._aside = np.array([_ASIDE * (high[0] - low[0]) if scan.layers else 0.0, 0.0, 0.0])
         self._splats = None if scan.splats is None else splat_arrays(scan.splats)
+        names = tuple(scan.layers) or ("nothing",)
+        self._layer = gui.add_dropdown(
+            "surfaces by", names, visible=bool(scan.layers), hint=_LAYER_HINT
+        )
+        self._legend = gui.add_html("", visible=bool(scan.layers))
+        self._top = self._add_cut(gui)
+        self._frusta = gui.add_checkbox(
+            "pictures", True, visible=bool(len(scan.poses)), hint=_PICTURES_HINT
+        )
         self.said = gui.add_html(self._html("hint", can_click=bool(scan.layers)))
         """Below the settings: the answer to the latest click."""
         self._cameras: list[viser.CameraFrustumHandle] = []
@@ -415,13 +443,34 @@ class ScanPage:
 
         server.scene.on_click()(click)
 
+    def _add_cut(self, gui: viser.GuiApi) -> viser.GuiSliderHandle[float]:
+        """Adds the height above which nothing is drawn, in the capture's unit from the floor."""
+        scan, floor = self.scan, float(self._box[0][2])
+        highest = float(scan.centers[:, 2].max())
+        top = highest
+        if len(scan.poses):
+            top = min(top, float(np.median(scan.poses[:, 2, 3])) + _HEADROOM)
+        size = (highest - floor) / scan.meter
+        step = float(f"{max(size, 1e-6) / _CUTS:.0e}")
+        most = step * np.ceil(size / step)
+        first = step * np.clip(np.round((top - floor) / scan.meter / step), 0.0, most / step)
+        digits = max(0, 1 - int(np.floor(np.log10(step))))
+        most, first = round(float(most), digits), round(float(first), digits)
+        hint = f"{_CUT_HINT} {_UNITS[scan.unit]}"
+        return gui.add_slider(f"hide above [{scan.unit}]", 0.0, most, step, first, hint=hint)
+
+    @property
+    def _height(self) -> float:
+        """Height above which nothing is drawn [audit units]."""
+        return float(self._box[0][2]) + float(self._top.value) * self.scan.meter
+
     def click(self, origin: np.ndarray, direction: np.ndarray) -> Answer | None:
         """Answers a click along a ray, [3] each: on the page, and to the caller."""
         scan = self.scan
         if not scan.layers:
             return None
         with self._lock:
-            row = picked(scan, origin, direction, float(self._top.value))
+            row = picked(scan, origin, direction, self._height)
             if row is None:
                 self.said.content = self._html("hint", can_click=True)
                 self._server.scene.remove_by_name("/clicked")
@@ -447,12 +496,13 @@ class ScanPage:
 
     @staticmethod
     def _html(macro: str, **values: Any) -> str:
-        return render_macro("apps/viewer/scan.html", macro, **values)
+        return render_macro("apps/viewer/scan_page.html", macro, r_hint=_R_HINT, **values)
 
     def _draw(self) -> None:
         """Draws surfaces and splat, both below the cut."""
         scan, name, scene = self.scan, self._layer.value, self._server.scene
-        top = float(self._top.value)
+        top = self._height
+        self._legend.content = self._html("legend", **legend_of(scan, name))
         for camera in self._cameras:
             camera.visible = self._frusta.value
         if self._splats is not None:
@@ -515,17 +565,47 @@ class ScanPage:
                 f"/suggested/{number}", 1.0, 1.33, scale=0.25, color=_SUGGESTED,
                 wxyz=quaternion(pose[:3, :3]), position=pose[:3, 3],
             )  # fmt: skip
-            scene.add_label(f"/suggested/{number}/label", str(number))
+            # In the image plane: several views are taken from one position.
+            scene.add_label(
+                f"/suggested/{number}/label", str(number), position=(0.0, 0.0, _LABEL_AHEAD)
+            )
 
     def _frame(self) -> None:
-        """Puts the eye where the whole scan is in view."""
+        """Puts the eye where the whole scan is in view, and names its two halves."""
         low, high = self._box
+        if self._splats is not None and self.scan.layers:
+            front = np.array([0.5 * (low[0] + high[0]), low[1], low[2]])
+            scene = self._server.scene
+            scene.add_label("/surfaces-label", "surfaces", position=front, anchor="top-center")
+            scene.add_label(
+                "/splats-label", "splat trained on the pictures", position=front + self._aside,
+                anchor="top-center",
+            )  # fmt: skip
         high = high + (0.0 if self._splats is None else self._aside)
-        high[2] = max(min(high[2], float(self._top.value)), low[2])
-        corners = np.stack(np.meshgrid(*np.stack([low, high]).T), axis=-1).reshape(-1, 3)
-        eye = self._server.initial_camera
-        eye.fov = float(np.deg2rad(35.0))
-        eye.position, eye.look_at = framing(corners, 1.1)
+        high[2] = max(min(high[2], self._height), low[2])
+        place_eye(self._server, low, high)
+
+
+def legend_of(scan: Scan, layer: str) -> dict[str, Any]:
+    """Describes the colors of a layer: a bar from 0 to 1, or a color for each cause."""
+    unseen = css_color(np.array(UNSEEN, np.uint8))
+    if layer == "renderability":
+        stops = [css_color(color) for color in paint(np.linspace(0.0, 1.0, _STOPS), SCORES)]
+        return {"stops": stops, "causes": [], "unseen": unseen, "hint": _R_HINT}
+    causes: list[dict[str, str]] = []
+    if layer == "cause" and scan.facts is not None:
+        is_seen = scan.facts["standpoints"] > 0
+        for number, cause in enumerate(scan.causes):
+            rows = np.flatnonzero(is_seen & (scan.facts["cause"] == number))
+            if len(rows):
+                color = css_color(scan.layers[layer][rows[0]])
+                hint = ". ".join(
+                    part[:1].upper() + part[1:] for part in (cause["meaning"], cause["do"]) if part
+                )
+                causes.append(
+                    {"color": color, "name": cause.get("title", cause["name"]), "hint": f"{hint}."}
+                )
+    return {"stops": [], "causes": causes, "unseen": unseen, "hint": ""}
 
 
 @contextlib.contextmanager
@@ -535,7 +615,7 @@ def open_scan_page(
     """Shows a scan for as long as the context lasts.
 
     Args:
-        scan: what is shown.
+        scan: content of the page.
         host: address to listen at.
         port: port to listen at; 0 takes any free one.
         allow: further host names under which the page may be requested.
