@@ -52,7 +52,7 @@ def live_shares(source: Source, counts: list[int]) -> list[float]:
                     arrival = Arrival(source.labels[before], before, source.read(before))
                     guide.add(first, arrival, is_latest=False)
             arrival = Arrival(source.labels[index], index, source.read(index))
-            guide.add(first, arrival, is_latest=index + 1 in counts)
+            guide.add(first, arrival, is_latest=True)
             if index + 1 in counts:
                 answer = page.answer("news.json")
                 assert answer is not None

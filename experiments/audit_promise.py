@@ -10,7 +10,7 @@ are then known. The same is done with as many pictures at random places of the s
 
 Two shares are compared: that of the page, which chooses standpoints again; and that from the
 standpoints of the first audit. What is done in `--work` is not done again. How much
-less comes than was simulated is what `apps/audit/promise.py` holds.
+less comes than was simulated is held in `apps/audit/suggest.py`.
 """
 
 import dataclasses
@@ -196,7 +196,7 @@ def obtained(before: Audit, source: Source) -> dict[str, float]:
         scores = score_from_standpoints(seen.state, demand, before.camera.focal, before.config)
         return diagnose(seen.state, demand, scores)
 
-    now = scored(places.standing[: AuditSettings.num_standpoints])
+    now = scored(places.standpoints)
     same = scored(there)
     return {
         "fine": now.fine_share,
@@ -280,7 +280,7 @@ def table(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def summary(records: list[dict[str, Any]]) -> dict[str, Any]:
-    """What `apps/audit/promise.py` holds, and how well it holds in scenes not counted."""
+    """Formats the constants of `apps/audit/suggest.py`, and tests them in scenes left out."""
     gain = lambda what, name: [100.0 * (r[what][name] - r["before"]["fine"]) for r in records]
     return {
         "captures": len(records),

@@ -287,8 +287,23 @@ def join_on_rows(
     after = add_pixels(part, frame, max_range, drop_edges)
     # A first measurement clears a row's marks, as its voxel may have been removed; not so here.
     marks = part.visited | after.visited, jnp.maximum(part.resolution, after.resolution)
-    mark = by_platform(cpu=_mark_by_kernel, default=_mark_by_formula)
-    return mark(eqx.tree_at(_marks, after, marks), whole, frame, reach)
+    return _mark(eqx.tree_at(_marks, after, marks), whole, frame, reach)
+
+
+@jax.jit
+def mark_again(state: MapState, frame: Frame, max_range: Float[Array, ""]) -> MapState:
+    """Marks the voxels in view of an earlier frame, those that later frames have added included.
+
+    Args:
+        state: the map after all frames.
+        frame: the earlier frame.
+        max_range: voxels farther from the camera do not count [audit units].
+    """
+    return _mark(state, state, frame, max_range)
+
+
+def _mark(part: MapState, whole: MapState, frame: Frame, reach: Float[Array, ""]) -> MapState:
+    return by_platform(cpu=_mark_by_kernel, default=_mark_by_formula)(part, whole, frame, reach)
 
 
 _marks = lambda m: (m.visited, m.resolution)

@@ -43,6 +43,14 @@ _FEWEST = 24
 _OVER = 4
 """At most one in this number of places is reached only at arm's length."""
 
+_NEAR_PICTURES = 1.5
+"""Standpoints in free space are at most this far from a camera's position [m]. A doorway that opens
+in one grid and not in the next would otherwise add a room in which no picture was taken: in a
+recording of 48 pictures it moved the share of surfaces seen well from 75 to 33 %."""
+
+NUM_STANDPOINTS = 24
+"""Maximum number of positions from which surfaces are evaluated."""
+
 
 @dataclass(frozen=True)
 class Places:
@@ -61,11 +69,15 @@ class Places:
     is_checked: bool
     """False if the floor is not known: then standing was not checked."""
 
+    standpoints: np.ndarray
+    """Positions from which surfaces are evaluated, [q, 3] [audit units]: above a person's feet and,
+    in free space, near a picture."""
+
     @property
     def seen_from(self) -> str:
-        """Description of the surface evaluated from here, for reports."""
+        """Description of the surface evaluated from the standpoints, for reports."""
         if self.is_checked:
-            return "the surface visible from where a person could stand"
+            return "the surface visible from where a person could stand near the pictures"
         return "the surface visible from around the cameras"
 
     @property
@@ -84,8 +96,9 @@ def places_of(
     meter: float | None,
     center: np.ndarray | None = None,
     with_cameras: bool = False,
+    num_standpoints: int = NUM_STANDPOINTS,
 ) -> Places:
-    """Spreads places where a person could hold a camera.
+    """Spreads places where a person could hold a camera, and standpoints among them.
 
     Args:
         state: the map of the capture.
@@ -96,6 +109,7 @@ def places_of(
         meter: length of a meter [audit units]; None if the capture's unit is not known.
         center: center of an object that the cameras surround; None if there is none.
         with_cameras: True to have the cameras' own positions among the places, but for a dome.
+        num_standpoints: maximum number of standpoints.
 
     Returns:
         Places in known free space; if there are few, also the cameras' own positions.
@@ -113,17 +127,31 @@ def places_of(
     is_walked = is_dense and center is None
     ground = ground_of(grid, voxels, cameras, meter) if is_walked else None
     footing = None if ground is None else ground.footing(found)
+    reach = _NEAR_PICTURES * (meter or 1.0) if is_walked else np.inf
     if footing is None or footing.is_over.all():
         eyes = found[spread(found, num)]
-        return Places(eyes, np.full_like(eyes, np.nan), len(eyes), is_checked=False)
+        standpoints = _standpoints(found, cameras, reach, num_standpoints)
+        return Places(eyes, np.full_like(eyes, np.nan), len(eyes), False, standpoints)
     standing = np.flatnonzero(~footing.is_over)
+    standpoints = _standpoints(found[standing], cameras, reach, num_standpoints)
     reached = np.flatnonzero(footing.is_over & footing.is_reached)
     few = min(num // _OVER, len(reached))
     standing = standing[spread(found[standing], num - few)]
     if few:
         reached = reached[spread(found[reached], few)]
     rows = np.concatenate([standing, reached[:few]])
-    return Places(found[rows], footing.feet[rows], len(standing), is_checked=True)
+    return Places(found[rows], footing.feet[rows], len(standing), True, standpoints)
+
+
+def _standpoints(standing: np.ndarray, cameras: np.ndarray, reach: float, num: int) -> np.ndarray:
+    """Spreads standpoints over the places [c, 3] within reach of a camera [n, 3], if there are any.
+
+    Returns:
+        [q, 3], 1 <= q <= num.
+    """
+    near = standing[np.asarray(KDTree(cameras).query(standing)[0]) <= reach]
+    chosen = near if len(near) else standing
+    return chosen[spread(chosen, num)]
 
 
 _INWARD = 0.85

@@ -232,20 +232,31 @@ def survey_of(source: Source, settings: SurveySettings) -> Survey:
     _check_voxel(voxel, bounds, scale)
     gap = cameras - np.median(cameras, axis=0)
     least = float(np.cbrt(np.prod(bounds[1] - bounds[0]) / _MOST_CELLS))
+    cell = max(_CELL, 2.0 * voxel, least)
     return Survey(
         alignment=alignment,
         up=up,
         chosen=chosen,
         strays=tuple(left_out.tolist()),
-        bounds=bounds,
+        bounds=on_lattice(bounds, cell),
         voxel_size=voxel,
-        cell_size=max(_CELL, 2.0 * voxel, least),
+        cell_size=cell,
         median_depth=median,
         far_depth=far,
         span=2.0 * float(np.linalg.norm(gap, axis=1).max()),
         unit="m" if source.is_metric else "u",
         doubt=doubt,
     )
+
+
+def on_lattice(bounds: np.ndarray, cell_size: float) -> np.ndarray:
+    """Extends a box [2, 3] to whole cells counted from the origin.
+
+    Grids of the same place then have the same cells, whatever else they contain: a doorway is as
+    wide in the audit of a capture as it was on the page that was shown during the scan.
+    """
+    low, high = bounds / cell_size
+    return cell_size * np.stack([np.floor(low), np.ceil(high)])
 
 
 def _depth_images(source: Source, chosen: np.ndarray) -> list[DepthImage]:

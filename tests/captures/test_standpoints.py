@@ -10,10 +10,12 @@ from r3jax.captures.standpoints import (
     inward_center,
     places_in_free_space,
     places_in_hull,
+    places_of,
     places_on_dome,
 )
 from r3jax.captures.survey import MARGIN
 from r3jax.mapping.occupancy import LOG_ODDS_LIMIT, OccupancyGrid, empty_grid
+from r3jax.mapping.state import empty_map
 from tests.apps.audit.room import pose_at
 
 
@@ -41,6 +43,21 @@ def test_places_lie_in_the_room_of_the_camera_at_its_heights_with_a_margin():
     assert np.abs(places[:, 2] - 1.4).max() <= 0.1 + MARGIN + 1e-6
     walls = np.array([[0.2, 0.2], [3.2, 3.2]])
     assert (np.abs(places[:, None, :2] - walls[None]).min(axis=(1, 2)) >= MARGIN - 1e-6).all()
+
+
+def test_surfaces_are_evaluated_from_near_the_pictures_even_if_a_door_opens_far_away():
+    closed, opened = two_rooms(), two_rooms()
+    opened[15:18, 4:13, 1:13] = True  # a doorway, wide enough to walk through
+    cameras = np.array([[1.0, 1.5, 1.4], [1.4, 1.7, 1.4]])
+    found = [
+        places_of(empty_map(64, 0.05), grid_of(free), cameras, 64, is_dense=True, meter=1.0)
+        for free in (closed, opened)
+    ]
+    assert found[0].eyes[:, 0].max() < 3.2 < found[1].eyes[:, 0].max()
+    for places in found:
+        gap = np.linalg.norm(places.standpoints[:, None] - cameras, axis=2).min(axis=1)
+        assert gap.max() <= 1.5
+    np.testing.assert_array_equal(found[0].standpoints, found[1].standpoints)
 
 
 def test_a_camera_close_to_a_wall_still_means_its_room():

@@ -5,14 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from r3jax.captures.agreement import DepthImage, check_agreement
 from r3jax.captures.settings import SurveySettings
 from r3jax.captures.source import ray_lengths, source_of
-from r3jax.captures.survey import survey_of
+from r3jax.captures.survey import on_lattice, survey_of
 from r3jax.formats.recordings import read_recording
 from r3jax.geometry.cameras import Camera
+from r3jax.mapping.occupancy import empty_grid
 from tests.apps.audit.room import (
     LENS,
     picture,
@@ -22,6 +25,21 @@ from tests.apps.audit.room import (
     write_recording,
 )
 from tests.conftest import shared_path
+
+
+@given(st.integers(0, 500), st.floats(0.2, 1.7))
+def test_grids_of_one_place_have_the_same_cells(seed, cell):
+    """A cell of one grid is a cell of the other, whatever box each of them covers."""
+    rng = np.random.default_rng(seed)
+    low = rng.uniform(-9.0, 9.0, (2, 3))
+    boxes = [np.stack([a, a + rng.uniform(0.1, 9.0, 3)]) for a in low]
+    a, b = (empty_grid(on_lattice(box, cell), cell) for box in boxes)
+    between = (np.asarray(a.origin, np.float64) - np.asarray(b.origin)) / cell
+    np.testing.assert_allclose(between, np.round(between), atol=1e-4)
+    for box, grid in zip(boxes, (a, b), strict=True):
+        assert (np.asarray(grid.origin) <= box[0] + 1e-4).all()
+        assert (np.asarray(grid.origin) + cell * np.array(grid.log_odds.shape) >= box[1]).all()
+
 
 SHOWN = [(picture(pose)[1], pose) for pose in round_poses(16)]
 

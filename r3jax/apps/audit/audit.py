@@ -11,22 +11,20 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 
-from r3jax.apps.audit.bad_regions import (
-    Region,
-    bad_regions,
-    blank_points,
-    blank_regions,
-    unseen_edges,
-    unseen_regions,
-)
 from r3jax.apps.audit.diagnosis import (
     NOT_KNOWN,
     Demand,
     Diagnosis,
     Pictures,
+    Region,
     ViewScore,
+    bad_regions,
+    blank_points,
+    blank_regions,
     demand_of,
     known_rows,
+    unseen_edges,
+    unseen_regions,
     view_score,
 )
 from r3jax.apps.audit.settings import AuditSettings
@@ -91,10 +89,6 @@ class Audit:
     places: Places
     """Positions that were searched for views."""
 
-    standpoints: np.ndarray
-    """Positions from which surfaces were evaluated: the first of the standing places, [q, 3] [audit
-    units]."""
-
     is_object: bool
     """True if the cameras look inward: the places then form a dome of cameras around an object."""
 
@@ -121,6 +115,11 @@ class Audit:
 
     faults: Faults
     """Faults of single frames: blur, light, poses, repetition."""
+
+    @property
+    def standpoints(self) -> np.ndarray:
+        """Positions from which surfaces were evaluated, [q, 3] [audit units]."""
+        return self.places.standpoints
 
     @property
     def diagnosis(self) -> Diagnosis:
@@ -234,13 +233,13 @@ def audit(
         meter=survey.alignment.scale if source.is_metric else None,
         center=center,
         with_cameras=True,
+        num_standpoints=settings.num_standpoints,
     )
-    standpoints = places.standing[: settings.num_standpoints]
     on_progress("evaluating frames", 0)
     frames = tuple(_evaluated_frames(source, survey, seen, config, path, step, on_progress))
     open_grid = _open_grid(source, survey, seen, cameras, config)
     on_progress("choosing views", settings.views)
-    demand = demand_of(seen.state, standpoints, config)
+    demand = demand_of(seen.state, places.standpoints, config)
     known = jnp.asarray(known_rows(seen.state, source.is_complete))
     task = Task(camera, Demand(demand.position, demand.visible & known[None]), config)
     plan = suggest(
@@ -261,7 +260,6 @@ def audit(
         config=config,
         lens=lens,
         places=places,
-        standpoints=standpoints,
         is_object=center is not None,
         frames=frames,
         is_own_path=path is None,

@@ -9,14 +9,11 @@ import numpy as np
 
 from r3jax.apps.audit import audit_figures, sentences
 from r3jax.apps.audit.audit import Audit
-from r3jax.apps.audit.bad_regions import Region
-from r3jax.apps.audit.diagnosis import NOT_KNOWN
+from r3jax.apps.audit.audit_figures import COLOR_OF_CAUSE, plan_figure, value_figure
+from r3jax.apps.audit.diagnosis import NOT_KNOWN, Region
 from r3jax.apps.audit.directions import way_to
-from r3jax.apps.audit.ground_plan import COLOR_OF_CAUSE, plan_figure, value_figure
-from r3jax.apps.audit.outputs import suggested_poses
-from r3jax.apps.audit.preview import Preview
-from r3jax.apps.audit.promise import promise
-from r3jax.apps.audit.suggest import Suggestion
+from r3jax.apps.audit.outputs import Preview, suggested_poses
+from r3jax.apps.audit.suggest import Suggestion, promise
 from r3jax.captures.faults.faults import Finding
 from r3jax.files import write_atomic
 from r3jax.plots.page import render
@@ -290,6 +287,7 @@ def _views(audit: Audit) -> list[dict[str, Any]]:
                 "reason": sentences.reason(audit, view, letters),
                 "rank": view.rank,
                 "position": sentences.point(pose[:3, 3]),
+                "unit": audit.survey.unit,
                 "ahead": sentences.point(pose[:3, 2]),
                 "pictures": [
                     {"png": to_png(figure), "caption": caption}

@@ -167,7 +167,7 @@ def _face_words(turn: float) -> str:
     return f"face {_rounded(turn):.0f}° to the {'left' if turn > 0 else 'right'} of {_THERE}"
 
 
-_THERE = "where that picture looks"
+_THERE = "the direction of that picture"
 
 
 def way_to(source: Source, survey: Survey, seen: Seen, view: Suggestion) -> Way:
@@ -191,7 +191,7 @@ def way_to(source: Source, survey: Survey, seen: Seen, view: Suggestion) -> Way:
     like, share = _likest_picture(source, survey, seen, view)
     target = like if share >= _SHOWS and source.has_images else None
     if target is not None and target != int(survey.chosen[nearest]):
-        until = f"until you see what is ringed in {source.labels[target]}"
+        until = f"until you see the ringed surface of {source.labels[target]}"
         steps = [f"{s} {until}" if s.startswith(("turn", "face")) else s for s in steps]
     label = source.labels[int(survey.chosen[nearest])]
     parts = [f"Stand where you took {label}", *steps]
@@ -205,7 +205,7 @@ def way_to(source: Source, survey: Survey, seen: Seen, view: Suggestion) -> Way:
 def _reach(feet: np.ndarray, pose: np.ndarray, meter: float, unit: str) -> str:
     """Describes how far to hold the camera out over an obstacle."""
     out = float(np.linalg.norm(pose[:2, 3] - feet[:2, 3])) / meter
-    return f"hold the camera {spoken_length(out, unit)} out over what stands there"
+    return f"hold the camera {spoken_length(out, unit)} out over the obstacle there"
 
 
 def _order(here: np.ndarray, there: np.ndarray, grid: OccupancyGrid) -> Order:

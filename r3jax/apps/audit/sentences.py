@@ -8,8 +8,7 @@ import numpy as np
 
 from r3jax.apps.audit.audit import SATURATED, Audit
 from r3jax.apps.audit.diagnosis import FEW, FINE, NOT_KNOWN
-from r3jax.apps.audit.promise import promise, random_promise
-from r3jax.apps.audit.suggest import DIRECTIONS, OVERLAP, Suggestion
+from r3jax.apps.audit.suggest import DIRECTIONS, OVERLAP, Suggestion, promise, random_promise
 from r3jax.captures.alignment import AXES
 
 MEANING = {
@@ -363,11 +362,11 @@ def method(audit: Audit) -> list[str]:
         "Renderability R (arXiv 2601.07484) of a surface from a position is bias × noise × "
         "resolution: the angle to the nearest direction from which it was seen, the consistency "
         "of its color, and the smallest distance from which it was seen.",
-        f"Surfaces: every voxel is scored from those of {len(audit.standpoints)} standpoints that "
-        "see it, with the most common camera; its score is the mean. Areas count one face of "
-        "each voxel on the floor, walls, ceiling and all sides of furniture, so they are several "
-        "times the floor area. With noisy depth, walls are several voxels thick, and areas are "
-        "overestimated.",
+        f"Surfaces: every voxel is scored from those of {len(audit.standpoints)} standpoints, "
+        "spread over the places near the pictures, that see it, with the most common camera; its "
+        "score is the mean. Areas count one face of each voxel on the floor, walls, ceiling and "
+        "all sides of furniture, so they are several times the floor area. With noisy depth, walls "
+        "are several voxels thick, and areas are overestimated.",
         _standing(audit),
     ]
     pixels = (

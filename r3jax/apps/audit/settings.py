@@ -28,7 +28,7 @@ class AuditSettings(SurveySettings):
     """Maximum number of positions searched for views."""
 
     num_standpoints: int = 24
-    """Maximum number of these positions used as standpoints to evaluate the surfaces."""
+    """Maximum number of standpoints from which the surfaces are evaluated."""
 
     seed: int = 0
     """Random seed of the random views that serve as a baseline for the suggested ones."""

@@ -7,12 +7,17 @@ from pathlib import Path
 
 from r3jax.apps.audit import sentences
 from r3jax.apps.audit.audit import Audit, audit
+from r3jax.apps.audit.audit_figures import region_letter
 from r3jax.apps.audit.audit_page import write_report
-from r3jax.apps.audit.ground_plan import region_letter
 from r3jax.apps.audit.live.follow import follow
 from r3jax.apps.audit.live.guide_page import open_guide
-from r3jax.apps.audit.outputs import audited_capture, suggested_poses, write_outputs
-from r3jax.apps.audit.preview import Preview, train_preview
+from r3jax.apps.audit.outputs import (
+    Preview,
+    audited_capture,
+    suggested_poses,
+    train_preview,
+    write_outputs,
+)
 from r3jax.apps.audit.settings import AuditSettings
 from r3jax.captures.camera_paths import CameraPath, path_of
 from r3jax.captures.source import Source, source_of

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from r3jax.apps.audit.audit import Audit, audit
+from r3jax.apps.audit.audit_figures import _value_picture
 from r3jax.apps.audit.audit_page import picture_faults
 from r3jax.apps.audit.diagnosis import (
     CAUSES,
@@ -18,7 +19,6 @@ from r3jax.apps.audit.diagnosis import (
     known_rows,
     view_score,
 )
-from r3jax.apps.audit.ground_plan import _value_picture
 from r3jax.apps.audit.outputs import record_of, suggested_poses, write_outputs
 from r3jax.apps.audit.sentences import (
     CONTRADICTED,

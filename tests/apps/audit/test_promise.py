@@ -6,7 +6,7 @@ from pathlib import Path
 from hypothesis import given
 from hypothesis import strategies as st
 
-from r3jax.apps.audit import promise as module
+from r3jax.apps.audit import suggest as module
 
 RESULT = Path(__file__).parents[3] / "experiments/results/audit_promise/promise.json"
 

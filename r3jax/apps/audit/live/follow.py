@@ -9,21 +9,27 @@ arrived, because advice that changes with every step cannot be followed.
 import queue
 import threading
 from collections import deque
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from r3jax.apps.audit.live.growing import Arrival, GrowingCapture
 from r3jax.apps.audit.live.guide_page import GuidePage
 from r3jax.captures.alignment import Alignment, rotation_to_z, up_of
+from r3jax.captures.capture_maps import mark_again
 from r3jax.captures.faults.blocks import BlockImage, block_image
 from r3jax.captures.faults.faults import Kind, faults_of
 from r3jax.captures.source import Source
+from r3jax.captures.survey import MARGIN, RANGE, on_lattice
 from r3jax.captures.vertical import Normals, block_normals, estimated_up
 from r3jax.formats.ros.bags import Topics
 from r3jax.frame import Frame
+from r3jax.geometry.cameras import Camera
 from r3jax.mapping.config import MappingConfig
 from r3jax.planning.growth import GrowthAhead
 from r3jax.planning.planner import Planner, decide, observe, start
@@ -49,6 +55,12 @@ _PATIENCE = 8
 
 _COMPARED = 8
 """Number of recent frames with which a new one is compared for blur and light."""
+
+_MARKED_AGAIN = 8
+"""Number of earlier frames, in turn, in whose views voxels are marked again with each new one."""
+
+_DEEPEST = 65.0
+"""Largest depth that is stored of an earlier frame, in whole millimeters [m]."""
 
 _CAPACITY = 1 << 17
 """Initial number of rows of the map: 200 square meters of surface."""
@@ -87,6 +99,7 @@ class Guide:
         self._normals: dict[int, Normals] = {}  # in the cameras' axes: poses may be corrected
         self._guess: tuple[int, np.ndarray] | None = None
         self._recent: deque[tuple[str, BlockImage]] = deque(maxlen=_COMPARED)
+        self._earlier: deque[tuple[np.ndarray, Camera, Array]] = deque()
         self._target: np.ndarray | None = None
         self._since = 0
         self._questions: queue.SimpleQueue[tuple[Planner, Frame] | None] = queue.SimpleQueue()
@@ -107,6 +120,7 @@ class Guide:
         """Forgets everything: all frames will be added again."""
         self._planner, self._target = None, None
         self._recent.clear()
+        self._earlier.clear()
         self._page.forget()
 
     def add(self, source: Source, arrival: Arrival, *, is_latest: bool) -> None:
@@ -119,15 +133,33 @@ class Guide:
         frame = source.framed(arrival.picture, arrival.index, self._alignment)
         self._planner = observe(self._planner, frame)
         self._growth.look(self._planner, frame)
+        depth_mm = np.rint(1000.0 * np.clip(frame.depth, 0.0, _DEEPEST)).astype(np.uint16)
+        self._earlier.append((depth_mm, frame.camera, frame.T_world_camera))
         if not is_latest:
             self._page.passed(frame)
             return
+        self._mark_again()
         warnings = self._warnings(source, arrival)
         self._page.observed(self._planner, frame, name=arrival.name, warnings=warnings)
         self._since += 1
         if self._target is None or self._since > _PATIENCE or self._has_arrived(frame):
             self._target, self._since = None, 0
             self._questions.put((self._planner, frame))
+
+    def _mark_again(self) -> None:
+        """Marks voxels in the views of some earlier frames, as an audit does in those of all.
+
+        When these frames arrived, the map lacked the surfaces that were added since.
+        """
+        assert self._planner is not None
+        state = self._planner.map_state
+        for _ in range(min(_MARKED_AGAIN, len(self._earlier))):
+            depth_mm, camera, pose = self._earlier[0]
+            self._earlier.rotate(-1)
+            depth = jnp.asarray(depth_mm, jnp.float32) / 1000.0
+            frame = Frame(jnp.zeros((*depth.shape, 3)), depth, pose, camera)
+            state = mark_again(state, frame, jnp.float32(RANGE))
+        self._planner = replace(self._planner, map_state=state)
 
     def _up(self, source: Source) -> np.ndarray:
         """Returns the vertical.
@@ -154,14 +186,15 @@ class Guide:
         center = poses[arrival.index, :3, 3]
         far = np.abs(poses[:, :3, 3] - center).max(axis=0) + 2.0 * _RIM
         half = np.where([True, True, False], np.maximum(_HALF_SIZE, 1.5 * far), _HALF_SIZE)
-        self._bounds = np.stack([center - half, center + half])
+        config = MappingConfig(capacity=_CAPACITY, remove_moved=False, start_radius=MARGIN)
+        self._bounds = on_lattice(np.stack([center - half, center + half]), config.cell_size)
         self._planner = start(
             source.camera(arrival.index),
             self._bounds,
             self._policy,
             starts=[poses[arrival.index]],
-            # The same orientation as in the audit of the finished capture.
-            config=MappingConfig(capacity=_CAPACITY, remove_moved=False),
+            # As in the audit of the finished capture.
+            config=config,
         )
 
     def _warnings(self, source: Source, arrival: Arrival) -> list[str]:

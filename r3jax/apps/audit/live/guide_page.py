@@ -26,8 +26,13 @@ from urllib.parse import urlsplit
 import numpy as np
 from matplotlib import colormaps
 
-from r3jax.apps.audit.bad_regions import unseen_edges
-from r3jax.apps.audit.diagnosis import CAUSES, demand_of, diagnose, score_from_standpoints
+from r3jax.apps.audit.diagnosis import (
+    CAUSES,
+    demand_of,
+    diagnose,
+    score_from_standpoints,
+    unseen_edges,
+)
 from r3jax.apps.audit.directions import steps_between
 from r3jax.apps.audit.sentences import GOOD, SHORT, listed
 from r3jax.apps.audit.settings import AuditSettings
@@ -232,9 +237,6 @@ class _Handler(BaseHTTPRequestHandler):
         """Logs nothing to the console."""
 
 
-_STANDPOINTS = AuditSettings.num_standpoints
-"""Number of standpoints from which surfaces are scored, as in an audit."""
-
 _HEADROOM = 0.35
 """As in `floor_picture` [m]."""
 
@@ -293,7 +295,7 @@ class ScanProgress:
 
 
 def scan_progress(planner: Planner, camera: Camera, places: np.ndarray) -> ScanProgress:
-    """Scores the surfaces seen so far like an audit, from fewer places.
+    """Scores the surfaces seen so far from the standpoints of an audit.
 
     Args:
         planner: provides map and grid.
@@ -305,8 +307,8 @@ def scan_progress(planner: Planner, camera: Camera, places: np.ndarray) -> ScanP
     # As in an audit: the camera's own positions are free, even if the sensor reports otherwise.
     grid = free_round(planner.grid, places)
     num = AuditSettings.num_places
-    stand = places_of(state, grid, places, num, is_dense=True, meter=1.0)
-    demand = demand_of(state, stand.standing[:_STANDPOINTS], config)
+    stand = places_of(state, grid, places, num, is_dense=True, meter=1.0, with_cameras=True)
+    demand = demand_of(state, stand.standpoints, config)
     found = diagnose(state, demand, score_from_standpoints(state, demand, camera.focal, config))
     value = np.where(found.is_seen, found.value, np.nan)
     causes = {name: found.share(name) for name in CAUSES if name != "fine"}

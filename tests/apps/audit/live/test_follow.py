@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 import r3jax
+from r3jax.apps.audit.audit import audit
 from r3jax.apps.audit.live import follow as module
 from r3jax.apps.audit.live.follow import follow
 from r3jax.apps.audit.live.guide_page import open_guide, scan_progress
+from r3jax.apps.audit.settings import AuditSettings
 from tests.apps.audit.room import LENS, SIZE, picture, round_poses, write_recording
 
 POSES = round_poses(10)
@@ -74,6 +76,8 @@ def test_a_folder_that_grows_is_followed_and_what_came_in_is_left(tmp_path, monk
     assert source.labels == tuple(f"{i:03d}.png" for i in range(9))
     np.testing.assert_allclose(source.poses, POSES[:9], atol=1e-9)
     assert np.array_equal(source.read(8)[0], picture(POSES[8])[0])
+    audited = audit(source, AuditSettings(up="z", views=0, folds=2))
+    assert found["fine_share"] == pytest.approx(audited.diagnosis.fine_share, abs=0.05)
 
 
 def test_a_robot_shows_the_same_page_with_three_verbs():
