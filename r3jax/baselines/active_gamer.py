@@ -108,7 +108,7 @@ class LatticeStage:
         lowest, highest = (np.array(travel.heights) - travel.origin[2]) - (
             layer_of_floor * travel.cell_size
         )
-        # Cells half way between two levels belong to one of them only.
+        # Cells halfway between two levels belong to one of them only.
         borders = [-np.inf, *(0.5 * (a + b) for a, b in pairwise(self.heights)), np.inf]
         layers: list[np.ndarray] = []
         is_there: list[np.ndarray] = []
@@ -216,7 +216,7 @@ def draw_candidates(
 ) -> tuple[Pools, Draw | None]:
     """Updates the pools, and draws up to `num` candidates of the first stage that has any.
 
-    Those for which the camera cannot turn far enough on the way from here sit out, too.
+    Those for which the camera cannot turn far enough on the path from here are left out, too.
     """
     of_stage, num_ended = list(pools.of_stage), int(pools.num_ended)
     found = None

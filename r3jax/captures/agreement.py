@@ -31,12 +31,12 @@ _FEWEST_POINTS = 400
 """Minimum number of comparisons; with fewer, the images hardly overlap."""
 
 _SEE_THROUGH_RATIO = 0.8
-"""Points that others look through, for each that they see: 0.01 to 0.03 in good captures, 0.4 if
-the poses are off by 5 cm, 1 and more if the poses belong to other images."""
+"""Points that other images see through, for each that they see: 0.01 to 0.03 in good captures, 0.4
+if the poses are off by 5 cm, 1 and more if the poses belong to other images."""
 
 _MIN_SCORE, _GAIN, _EXPLAINED = 0.3, 0.1, 0.25
-"""Score that undoing a mistake must reach, what it must add, and the share of what was missing that
-this must be. Where the cameras are right no mistake adds more than 0.03, with noise of 1 % of the
+"""Minimum score after undoing a mistake, minimum gain, and minimum gain as a share of the missing
+score. Where the cameras are right no mistake adds more than 0.03, with noise of 1 % of the
 depth, 5 mm and 0.3 degrees; a focal length 1.25 times too long takes 0.2 to 0.4 of 0.65 to 0.94."""
 
 _CLIMBS = 4
@@ -269,8 +269,8 @@ def check_agreement(images: Sequence[DepthImage]) -> None:
     Images that do not overlap, or were taken from one place, are accepted: no depth is wrong there.
 
     Raises:
-        ValueError: a common mistake explains them far better; or nearly as many points lie where
-            another image looks through them as where it sees a surface.
+        ValueError: a common mistake explains them far better; or other images see through nearly as
+            many points as they see.
     """
     pictures = _coarser(images)
     found = _compared(pictures)
@@ -288,7 +288,7 @@ def check_agreement(images: Sequence[DepthImage]) -> None:
     if found.compared >= _FEWEST_POINTS and found.through > _SEE_THROUGH_RATIO * found.there:
         raise InputError(
             f"the frames contradict each other: {100 * found.through:.0f} % of what one shows is "
-            f"where others look through, and {100 * found.there:.0f} % where others see it: are "
+            f"where others see through, and {100 * found.there:.0f} % where others see it: are "
             "the poses and the depth images of one recording, and do the axes fit? --trust-depth "
             "audits it as it is"
         )

@@ -41,7 +41,7 @@ _LEVEL, _TILTED, _TILTED_SHARE = 4.0, 20.0, 0.25
 """How level cameras are held [deg], by most and by the rest of the poses."""
 
 _SIDEWAYS, _ANYHOW = 0.1, 0.02
-"""Shares of the poses that are held sideways (a phone upright), and in no way at all."""
+"""Shares of the poses held sideways (a phone upright), and in no particular orientation."""
 
 _PITCH, _PITCH_SPREAD, _ANY_PITCH = -15.0, 30.0, 0.1
 """Elevation of most viewing directions [deg], and the share of those anywhere."""

@@ -266,7 +266,7 @@ def _longest_view(position: np.ndarray, scene: TriangleScene) -> float:
 def _is_inside_furniture(position: np.ndarray, bounds: np.ndarray, scene: TriangleScene) -> bool:
     """Checks whether a place lies inside a closed solid that is too small for a room.
 
-    Many meshes have their faces the wrong way round, and a room may be a box seen from within:
+    Many meshes have inverted faces, and a room may be a box seen from within:
     so only a small shell that shows nothing but back faces, with a world outside it, counts.
     """
     directions = fibonacci_lattice(_PROBES)

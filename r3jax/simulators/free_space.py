@@ -268,7 +268,7 @@ def _reached(is_free: np.ndarray, nodes: _Nodes, start: np.ndarray) -> np.ndarra
     """Finds the free nodes that are connected to `start` [3] [m] face by face, [I, J, K] bool."""
     index = np.argwhere(is_free)
     away = np.linalg.norm(nodes.low + index * nodes.step - start, axis=1)
-    # The start lies between eight nodes; from the free ones of them nothing is in the way.
+    # The start lies between eight nodes; nothing is between it and the free ones of them.
     beside = index[away <= np.linalg.norm(nodes.step)]
     seeds = np.zeros_like(is_free)
     seeds[tuple(beside.T)] = True

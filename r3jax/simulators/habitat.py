@@ -15,7 +15,7 @@ stored in the file; for Replica the ray caster alone (`replica:<name>`) shows th
 
 Range and noise are ours, as those of the ray caster: depth beyond `max_range` is inf, and
 `NoisySimulator` adds the noise. Where Habitat finds no surface its depth is 0, which is our
-"no measurement" (the ray caster says inf there: it knows that nothing is there).
+"no measurement" (the ray caster returns inf there, as nothing is there).
 
 Our world is z-up with OpenCV camera axes. Habitat's is y-up with OpenGL camera axes (x right, y up,
 z backward). Between the two lies the mesh file, whose axes are its maker's. `habitat_from_world`
@@ -162,7 +162,7 @@ class HabitatSimulator:
 
     @property
     def content_hash(self) -> str:
-        """SHA-256 of what is shown; another one than that of the ray caster's scene."""
+        """SHA-256 of the content; it differs from that of the ray caster's scene."""
         who = "habitat, colors of the mesh" if self._mesh_colors else "habitat"
         return hashlib.sha256(f"{who} {self._mesh.world.content_hash}".encode()).hexdigest()
 
@@ -342,10 +342,10 @@ def _without_noise() -> Generator[None]:
 def default_gpu_device() -> int:
     """Returns the `gpu_device_id` for this machine: 0 with CUDA, otherwise -1.
 
-    Habitat-Sim ends the whole process when it is told a CUDA device that EGL does not have, so
-    nothing is tried: the CUDA driver is asked how many devices there are, which starts none, and
-    NVIDIA's EGL must be there (containers often have CUDA alone). -1 takes the first renderer
-    that EGL offers, also one on a CPU.
+    Habitat-Sim ends the whole process if EGL does not have the given CUDA device, so none is
+    tried. The CUDA driver reports the number of devices without starting one, and NVIDIA's EGL
+    must be installed (containers often have CUDA alone). -1 takes the first renderer that EGL
+    offers, which may run on a CPU.
     """
     try:
         driver = ctypes.CDLL("libcuda.so.1")
@@ -390,10 +390,10 @@ class HabitatStage:
     """A scene for Habitat."""
 
     file: Path
-    """What Habitat is told to load."""
+    """File that Habitat loads."""
 
     mesh: Path
-    """What it then shows; the same file, but for a stage config."""
+    """Mesh that it shows: the same file, except for a stage config."""
 
     habitat_from_file: np.ndarray
     """Rotation [3, 3] from the mesh file's axes to Habitat's world."""

@@ -1,7 +1,7 @@
 """Mesh files as worlds: GLB, glTF, PLY, OBJ, STL and OFF.
 
 glTF is y-up by its standard and is turned to z-up, (x, y, z) -> (x, -z, y); other formats are
-taken as z-up unless told otherwise. Colors are used as stored, as Habitat does without lights.
+taken as z-up by default. Colors are used as stored, as Habitat does without lights.
 Transparency is ignored: a surface is there or it is not.
 
 Shape symbols: V vertices; F faces.
@@ -55,7 +55,7 @@ _STRIP = 5
 def check_claims(path: Path, tree: dict[str, Any]) -> None:
     """Refuses a glTF file that claims, or repeats, far more than it stores.
 
-    Memory is allocated for what is claimed, for every primitive.
+    Memory is allocated for the claimed size, for every primitive.
 
     Args:
         path: the file; its buffers lie in it or beside it.
@@ -132,7 +132,7 @@ def _accessor_size(
 
 
 def _check_sum(what: str, sizes: list[tuple[int, int]], stored: int) -> None:
-    """Refuses parts, (numbers, bytes) each, that are together far more than what is stored."""
+    """Refuses parts, (numbers, bytes) each, that are together far more than the file stores."""
     numbers, held = (sum(column) for column in zip(*sizes, strict=True)) if sizes else (0, 0)
     if numbers > _FEW and held > _MAX_REPEATS * stored:
         raise ForeignFileError(
@@ -250,7 +250,7 @@ def read_tree(path: Path) -> dict[str, Any]:
 
 
 def _check_chunks(path: Path) -> None:
-    """Refuses a GLB whose chunks claim to be longer than it: room is made for what is claimed."""
+    """Refuses a GLB whose chunks claim to be longer than the file: memory is allocated for them."""
     size = check_regular(path)
     with open(path, "rb") as file:
         at = 12  # behind the header
@@ -259,17 +259,17 @@ def _check_chunks(path: Path) -> None:
             (length,) = struct.unpack("<I", file.read(4))
             at += 8 + length
     if at > size:
-        raise ForeignFileError("it is cut off: a chunk is longer than what is left of the file")
+        raise ForeignFileError("truncated: a chunk is longer than the rest of the file")
 
 
 SUFFIXES = (".glb", ".gltf", ".ply", ".obj", ".stl", ".off")
 """Formats that are read."""
 
 GLTF_SUFFIXES = (".glb", ".gltf")
-"""Those of glTF."""
+"""Suffixes of glTF."""
 
 _IMAGES = ("PNG", "JPEG", "WEBP", "BMP", "TGA")
-"""Formats of textures; Pillow knows others that start programs of their own."""
+"""Formats of textures; Pillow reads others by starting external programs."""
 
 _MAX_TEXELS = 1 << 26
 """Most texels of one texture: 8192 x 8192."""
@@ -408,7 +408,7 @@ def _num_rows(mesh: Any) -> int:
 
 _Z_UP_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 _PLAIN = Material(color=(0.7, 0.7, 0.7))
-"""What a surface without any color looks like."""
+"""Material of a surface without any color."""
 
 _HEADER_BYTES = 1 << 14
 """A PLY's header has some hundred bytes."""
@@ -537,7 +537,7 @@ def _refuse_splat(path: Path) -> None:
 
 
 def _refuse_empty(path: Path, scene: Any) -> None:
-    """Says why a scene has nothing to look at."""
+    """Refuses a scene without surfaces, with the reason."""
     points = sum(len(getattr(g, "vertices", ())) for g in scene.geometry.values())
     if points:
         raise InputError(

@@ -70,9 +70,9 @@ def make_plan(
     """Makes every cell, scene by scene; renders and stores each scene's test views.
 
     Args:
-        request: what to do.
+        request: the cells to plan.
         root: folder of the benchmark.
-        on_stage: told what happens now.
+        on_stage: called with the name of each stage.
 
     Raises:
         ValueError: an unknown scene or policy, a setting that cannot work, nothing to do.
@@ -127,7 +127,7 @@ def prepare_scene(
         request: how scenes are opened, and on what terms.
         scene: which one.
         root: folder of the benchmark.
-        on_stage: told what happens now.
+        on_stage: called with the name of each stage.
 
     Raises:
         ValueError: an unknown scene, or one that cannot be explored.

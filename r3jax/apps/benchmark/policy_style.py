@@ -1,8 +1,8 @@
-"""One look per policy in every figure: color, marker and line. Ours are warm and thick.
+"""Defines one style per policy for all figures: color, marker and line. Ours are warm and thick.
 
 The colors are those of Okabe and Ito ("Color universal design", 2008), which people with any kind
-of color vision tell apart; the floor (frontier, uniform, random) is ink, brown and light gray.
-Markers and dashes say the same again, for print.
+of color vision can distinguish; the floor (frontier, uniform, random) is ink, brown and light gray.
+Markers and dashes repeat the distinction, for print.
 """
 
 from collections.abc import Sequence
@@ -71,10 +71,10 @@ _VARIANTS: tuple[tuple[Any, Literal["none", "left", "bottom"]], ...] = (
 
 
 def styles_of(methods: Sequence[str]) -> dict[str, PolicyStyle]:
-    """Returns the look of each method, as `equal_terms.method_name` writes it.
+    """Returns the style of each method, named as `equal_terms.method_name` writes it.
 
-    The first settings of a policy look the same in every figure; others have other dashes, and
-    markers that are hollow or half filled.
+    The first settings of a policy have the same style in every figure; others have other dashes,
+    and markers that are hollow or half filled.
     """
     seen: dict[str, int] = {}
     styles: dict[str, PolicyStyle] = {}

@@ -59,7 +59,7 @@ from r3jax.splatting.training.checkpoints import remove_checkpoints
 from r3jax.splatting.views import load_views
 
 OnStage = Callable[[str], None]
-"""Told what happens now, in a few words."""
+"""Callback with the name of a stage, in a few words."""
 
 _LOCK_PATIENCE = 20.0
 """A worker whose parent was killed needs a moment to notice [s]."""
@@ -73,9 +73,9 @@ def run_cell(cell: Cell, root: Path, on_stage: OnStage = lambda stage: None) -> 
     """Computes the unfinished part of a cell.
 
     Args:
-        cell: what to do.
+        cell: the cell to compute.
         root: folder of the benchmark.
-        on_stage: told what happens now.
+        on_stage: called with the name of each stage.
 
     Raises:
         CellError: another process works on it, or some snapshots failed; the others are recorded.
@@ -196,7 +196,7 @@ def _open(cell: Cell) -> Simulator:
     if found != cell.scene_hash:
         raise CellError(
             f"the scene {cell.scene} has the hash {found[:12]}, but {cell.scene_hash[:12]} when "
-            "the benchmark was planned: the file has changed meanwhile, start again"
+            "the benchmark was planned: the file has changed since then; start again"
         )
     return simulator
 

@@ -31,11 +31,11 @@ from r3jax.evaluation.comparison import (
 from r3jax.evaluation.scores import METRICS, POOR_PSNR, Metric
 
 FEWEST_SEEDS = 3
-"""That the protocol asks for in each cell of a table."""
+"""Seeds per cell of a table that the protocol requires."""
 
 
 _LONGEST = 24
-"""Of a value in a heading; what is longer, such as a hash, is cut."""
+"""Maximum length of a value in a heading; longer ones, such as a hash, are cut."""
 
 
 @dataclass(frozen=True)
@@ -43,16 +43,16 @@ class Entry:
     """One field of a table."""
 
     value: float | None
-    """With every digit; None where there is none, which is never shown as a number."""
+    """With all digits; None if there is none, which is never shown as a number."""
 
     text: str = ""
-    """As people read it."""
+    """Formatted value."""
 
     rank: int = 0
     """1 for the best of its column, 2 for the second best, 0 for others."""
 
     extra: Mapping[str, float | str] = field(default_factory=dict[str, float | str])
-    """What else the text tells (interval, name of a scene), by name, for machines."""
+    """Other content of the text (interval, name of a scene), by name, for machines."""
 
 
 MISSING = Entry(None)
@@ -167,9 +167,9 @@ def notes(cells: Sequence[Cell]) -> tuple[str, ...]:
     seeds = seeds_by_method(with_short_names(cells))
     counts = [len(found) for scenes in seeds.values() for found in scenes.values() if found]
     fewest, most = min(counts), max(counts)
-    told = f"{most}" if fewest == most else f"{fewest} to {most}"
+    count = f"{most}" if fewest == most else f"{fewest} to {most}"
     short = f", fewer than the {FEWEST_SEEDS} of the protocol" if fewest < FEWEST_SEEDS else ""
-    sentences.append(f"{told} seed{'s' * (most > 1)} per cell{short}.")
+    sentences.append(f"{count} seed{'s' * (most > 1)} per cell{short}.")
     absent = [f"{m} in {s}" for m, by_scene in seeds.items() for s, n in by_scene.items() if not n]
     if absent:
         sentences.append(f"No record of {', '.join(absent)}.")
@@ -206,7 +206,7 @@ def quality_table(cells: Sequence[Cell], title: str = "", *, with_intervals: boo
         ValueError: the records were not made on equal terms (`check_equal_terms`).
     """
     check_equal_terms(cells)
-    told, cells = notes(cells), with_short_names(cells)
+    below, cells = notes(cells), with_short_names(cells)
     scenes, methods, seeds = scenes_of(cells), methods_of(cells), seed_texts(cells)
     rows: dict[tuple[str, str], Row] = {}
     for name in PAPER_METRICS:
@@ -229,7 +229,7 @@ def quality_table(cells: Sequence[Cell], title: str = "", *, with_intervals: boo
         heads=("method", "metric"),
         columns=(*scenes, "mean"),
         rows=tuple(rows[method, name] for method in methods for name in PAPER_METRICS),
-        notes=told,
+        notes=below,
     )
 
 
@@ -269,7 +269,7 @@ def comparison_table(
         ValueError: records not on equal terms, or a reference that is not there.
     """
     check_equal_terms(cells)
-    told, cells = notes(cells), with_short_names(cells)
+    below, cells = notes(cells), with_short_names(cells)
     chosen = list(scenes or scenes_of(cells))
     cells = [cell for cell in cells if cell["scene"] in chosen]
     methods, seeds = methods_of(cells), seed_texts(cells)
@@ -307,7 +307,7 @@ def comparison_table(
         heads=("method",),
         columns=tuple(columns),
         rows=tuple(Row((method,), seeds[method], entries) for method, entries in lines),
-        notes=told,
+        notes=below,
     )
 
 
@@ -460,16 +460,16 @@ def headings_of(groups: Sequence[Sequence[Cell]]) -> list[str]:
     Args:
         groups: as `groups_on_equal_terms` makes them.
     """
-    told: list[list[str]] = [[] for _ in groups]
+    texts: list[list[str]] = [[] for _ in groups]
     for name, values in _terms_of_groups(groups).items():
         if len({repr(value) for value in values.values()}) > 1:
             for number, value in values.items():
                 text = str(value)
                 text = text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
-                told[number].append(f"{name}: {text}")
+                texts[number].append(f"{name}: {text}")
     headings: list[str] = []
     met: list[str] = []
-    for group, parts in zip(groups, told, strict=True):
+    for group, parts in zip(groups, texts, strict=True):
         heading = ", ".join([group[0]["snapshot"], *parts])
         met.append(heading)
         if (count := met.count(heading)) > 1:

@@ -241,7 +241,7 @@ class Outlook:
     """What to believe; None: what comes with the package."""
 
     frames: list[int] = field(default_factory=list[int])
-    """Frames taken before each forecast, those on the way included."""
+    """Frames taken before each forecast, those captured while moving included."""
 
     forecasts: list[Forecast] = field(default_factory=list[Forecast])
 

@@ -243,7 +243,7 @@ def in_order(observations: tuple[Observation, ...]) -> list[Observation]:
 def share(
     common: Common, until: float, config: ExplorationConfig, *, repeat_compiled: bool
 ) -> tuple[Common, list[SharedFrame]]:
-    """Holds a meeting: all frames up to a time join the common map.
+    """Integrates all frames up to a time into the common map: a meeting.
 
     Args:
         common: before.
@@ -252,7 +252,7 @@ def share(
         repeat_compiled: False where the exact time is not needed.
 
     Returns:
-        What is common now, and the frames that have become so, in order.
+        The common map after the meeting, and the frames that joined it, in order.
     """
     shared: list[SharedFrame] = []
     map_state, grid = common.map_state, common.grid
@@ -273,7 +273,7 @@ def share(
 
 @dataclass(frozen=True)
 class _Flying:
-    """One member under way."""
+    """One member during the mission."""
 
     number: int
     mission: Mission
@@ -283,10 +283,10 @@ class _Flying:
     rows: tuple[StepRow, ...] = ()
 
     received: tuple[SharedFrame, ...] = ()
-    """Frames that were shared since it last took any over."""
+    """Frames that were shared since this member last received any."""
 
     owed: float = 0.0
-    """Seconds that taking over took, and that no row has been charged for."""
+    """Time of receiving frames that no row has been charged for [s]."""
 
     stop: Stop | None = None
 

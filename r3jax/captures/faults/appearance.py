@@ -39,19 +39,19 @@ _SCALES = 1.4
 """Frames at a larger ratio of distances are not compared: fine detail is lost."""
 
 _NOISE = 0.5
-"""Detail that is next to nothing (of 255, squared)."""
+"""Detail below this is negligible (of 255, squared)."""
 
 _PLAIN = 10.0
-"""Percentile of the blocks' detail that is taken for noise: some walls are plain everywhere."""
+"""Percentile of the blocks' detail taken as the noise level: some walls are plain everywhere."""
 
 _WITNESSES = 2
-"""With two frames alone, the odd one cannot be identified."""
+"""Minimum number of neighbors: of two frames alone, the odd one cannot be identified."""
 
 _OBLIQUE = 25.0
-"""Nor are those that saw it from directions farther apart, as what is oblique looks finer [deg]."""
+"""Frames at larger angles to a surface are not compared: oblique views have finer detail [deg]."""
 
 _SHARP = 75.0
-"""Percentile of the neighbors' sharpness that a frame is held against."""
+"""Percentile of the neighbors' sharpness with which a frame is compared."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +59,8 @@ class Sharpness:
     """Sharpness of every frame, beside that of its neighbors."""
 
     share: np.ndarray
-    """Detail, as a share of what the sharper of its neighbors show of the same surface, [n]; NaN
-    where nothing can be compared."""
+    """Detail, as a share of that in its sharper neighbors on the same surface, [n]; NaN if nothing
+    can be compared."""
 
     lost_along: np.ndarray
     """Detail kept along the worst direction over that kept along the best one, [n]."""

@@ -1,13 +1,13 @@
-"""Images as numbers per block of pixels, and which blocks of two images show the same surface.
+"""Summarizes images per block of pixels, and matches blocks that show the same surface.
 
 Frames are compared where they show the same surface, at one working resolution: images of at most
-640 pixels, in blocks, 80 of them along the longer side. A block keeps its mean color, its depth,
-and how much fine detail it has in four directions. That is 150 kB a frame, whatever the camera's
+640 pixels, in blocks, 80 of them along the longer side. A block stores its mean color, its depth,
+and its fine detail in four directions. That is 150 kB per frame, independent of the camera's
 resolution.
 
 A frame is compared with a few neighbors only, however long the capture is: those before and after
-it, and those whose cameras were nearest and looked the same way. A point of one frame is looked up
-in the other; where the depth there agrees, both show it.
+it, and those whose cameras were nearest and had the same orientation. A point of one frame is
+projected into the other; if the depth there agrees, both show it.
 
 Shape symbols: n frames; H, W image size; h, w blocks of an image; b blocks in a row; m matches.
 """
@@ -158,25 +158,25 @@ _NEAR_BY = 6
 """Further neighbors, by their poses."""
 
 _TURNED = 60.0
-"""Cameras that look in directions farther apart have little in common [deg]."""
+"""Maximum angle between neighbors: beyond it cameras have little in common [deg]."""
 
 _AGREES = 0.05
-"""Surfaces that lie so close are one, as a share of their distance."""
+"""Surfaces closer than this are one, as a share of their distance."""
 
 FEWEST = 40
-"""Pairs of frames with fewer blocks in common say nothing."""
+"""Minimum number of common blocks of a pair of frames."""
 
 
 _REWEIGHTED = 8
 """Iterations of the reweighting of pairs."""
 
 _SMALLEST_ERROR = 1e-3
-"""Smaller differences are not told apart: the sum of absolute values has no second derivative."""
+"""Differences are bounded below by this: absolute values have no second derivative at 0."""
 
 
 @dataclass(frozen=True)
 class Overlap:
-    """What one frame finds of its blocks in another one."""
+    """Blocks of one frame that another frame shows."""
 
     first: int
     """Number of the frame whose blocks are looked up."""
@@ -209,17 +209,17 @@ def neighbor_pairs(images: Sequence[BlockImage]) -> np.ndarray:
     pairs: set[tuple[int, int]] = set()
     for i in range(count):
         angle = np.arccos(np.clip(axis @ axis[i], -1.0, 1.0))
-        apart = np.linalg.norm(place - place[i], axis=1) / typical + angle
-        apart[angle > np.radians(_TURNED)] = np.inf
-        apart[i] = np.inf
-        near = np.argsort(apart, kind="stable")[:_NEAR_BY]
-        found = [*near[np.isfinite(apart[near])].tolist(), *(i + k for k in _IN_ORDER)]
+        gap = np.linalg.norm(place - place[i], axis=1) / typical + angle
+        gap[angle > np.radians(_TURNED)] = np.inf
+        gap[i] = np.inf
+        near = np.argsort(gap, kind="stable")[:_NEAR_BY]
+        found = [*near[np.isfinite(gap[near])].tolist(), *(i + k for k in _IN_ORDER)]
         pairs |= {(min(i, j), max(i, j)) for j in found if j < count}
     return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
 
 
 def overlap(images: Sequence[BlockImage], first: int, second: int) -> Overlap:
-    """Looks the blocks of one frame up in another one."""
+    """Projects the blocks of one frame into another one."""
     seen = images[second]
     found = projected(seen.camera, seen.pose, images[first].points)
     own = np.flatnonzero(found.is_in)

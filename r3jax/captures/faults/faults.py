@@ -31,7 +31,7 @@ from r3jax.formats.errors import FormatError
 BLURRED = 0.45
 """Less of its neighbors' detail than this, and a frame is blurred: a motion of 3 pixels at the
 working resolution leaves 0.35, and sharp frames of a rendered walk 0.8 and more. In a recording by
-HoloLens those that look blurred have 0.26 to 0.48, and those that look sharp 0.45 and more."""
+HoloLens visibly blurred frames have 0.26 to 0.48, and visibly sharp ones 0.45 and more."""
 
 _SMEARED = 0.6
 """Detail kept along one direction over that along another, below which a blur has a direction:
@@ -127,7 +127,7 @@ def find_faults(
     *,
     fits: bool = True,
 ) -> Faults:
-    """Looks for blur, changing light, depth that contradicts the poses, and repetition.
+    """Finds blur, changing light, depth that contradicts the poses, and repetition.
 
     Args:
         source: the capture.

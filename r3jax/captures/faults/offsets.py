@@ -18,8 +18,8 @@ error of the depths or of the camera. With x, y, z a point in its camera and r t
     principal point         -(z, 0, 0) or -(0, z, 0), as a share of the focal length
     depth along the ray     -(1 - 1 / r) (x, y, z)
 
-These are much alike where frames show little; so each is fitted alone, and the one that leaves the
-least is believed.
+These are similar where frames show little; so each is fitted alone, and the one with the smallest
+residual is chosen.
 
 Shape symbols: n frames; m matches of a pair; b blocks.
 """
@@ -37,7 +37,7 @@ _GATE = 0.15
 """Surfaces farther apart than this are different ones, as a share of their distance."""
 
 _MATCHES = 200
-"""Matches of a pair that are used at most."""
+"""Maximum number of matches used of a pair."""
 
 _ROUNDS = 4
 """Iterations of the reweighting of matches."""
@@ -55,8 +55,8 @@ _SIX = np.arange(6)
 """Unknowns of a frame."""
 
 _PRIOR = 0.02
-"""Motions are sought that are small beside this, where nothing else decides: translations as a
-share of the median depth, rotations in radians."""
+"""Standard deviation of the prior on motions: translations as a share of the median depth,
+rotations in radians."""
 
 _ALIKE = 100.0
 """Matches that err together: those of a wall in a pair of frames."""
@@ -94,18 +94,18 @@ class Systematic:
     """One of `SYSTEMATIC`."""
 
     value: float
-    """By which the depths or the focal lengths are to be multiplied, what is to be added to the
-    principal point [focal lengths], or about 1 for depth along the ray."""
+    """Factor of the depths or the focal lengths, offset of the principal point [focal lengths], or
+    about 1 for depth along the ray."""
 
     @property
     def size(self) -> float:
-        """How large it is; 0 where there is none."""
+        """Magnitude of the error; 0 if there is none."""
         return float(np.log(self.value)) if self.kind in ("scale", "focal") else self.value
 
 
 @dataclass(frozen=True)
 class Offsets:
-    """By how much poses are off."""
+    """Errors of the poses."""
 
     distance: np.ndarray
     """How far the surfaces of each frame lie from where its neighbors show them, beyond what moves
@@ -114,7 +114,7 @@ class Offsets:
     is_explained: np.ndarray
     """True where the frame's surfaces lie apart from its neighbors', of which there are two or
     more, and moving the frame brings them together, [n]. Elsewhere a distance means little: nothing
-    need hold a frame that shows one wall."""
+    constrains a frame that shows one wall."""
 
     typical: float
     """Median distance of matching surfaces along their normals [capture units]: noise of the depth

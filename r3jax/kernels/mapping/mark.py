@@ -154,7 +154,7 @@ def _mark_all(visited, resolution, key, camera, frame, is_visible, bins, lattice
     flat, blocks = depth.reshape(depth.size), (capacity + _BLOCK - 1) // _BLOCK
     for worker in prange(workers):
         pixels, depths = np.empty(_BLOCK, np.int32), np.empty(_BLOCK, np.float32)
-        seen, shown = np.empty(_BLOCK, np.int32), np.empty(_BLOCK, np.int64)
+        seen, visible = np.empty(_BLOCK, np.int32), np.empty(_BLOCK, np.int64)
         for block in range(worker, blocks, workers):
             first, size = block * _BLOCK, min(_BLOCK, capacity - block * _BLOCK)
             num = _list_in_view(key, first, size, frame, voxel_size, pixels, depths, seen)
@@ -164,11 +164,11 @@ def _mark_all(visited, resolution, key, camera, frame, is_visible, bins, lattice
                     prefetch(flat, np.int64(pixels[seen[k + _AHEAD]]))
                 i = np.int64(seen[k])
                 pixel = np.int64(pixels[i])
-                shown[count] = first + i
+                visible[count] = first + i
                 count += _is_shown(
                     pixel, flat[pixel], depths[i], depth, voxel_size, is_visible[first + i] != 0
                 )
-            mark_rows(key, visited, resolution, shown, count, camera, bins, lattice)
+            mark_rows(key, visited, resolution, visible, count, camera, bins, lattice)
 
 
 @inlined_fused

@@ -1,7 +1,7 @@
 """Shortest paths from one cell of a grid to all others, in machine code.
 
 Dijkstra's algorithm with buckets (Dial 1969): a bucket holds cells whose costs differ by less than
-one, and no step is shorter than that, so that none of them can lie on the shortest way to another
+one, and no step is shorter than that, so that none of them can lie on the shortest path to another
 one. They are settled in any order, and no heap is needed. The costs are bit for bit those of
 Dijkstra's algorithm with a heap: the least of the same sums.
 
@@ -34,8 +34,8 @@ def shortest_paths(
         start: where they begin, a usable cell; None: nothing can be reached.
 
     Returns:
-        Lengths between cells' centers [cells], inf where there is no way; and the flat index of
-        the cell before, -1 at the start and where there is no way.
+        Lengths between cells' centers [cells], inf where there is no path; and the flat index of
+        the cell before, -1 at the start and where there is no path.
     """
     # A border of closed cells: no step needs to be checked against the edges.
     padded = np.pad(usable, 1)
@@ -114,7 +114,7 @@ def _settle(
         for i in range(num):
             here = queues[row, i]
             if int(cost[here]) < bucket:
-                continue  # a shorter way was found meanwhile, and it was settled earlier
+                continue  # a shorter path was found since then, and it was settled earlier
             for k in range(26):
                 there = here + steps[k]
                 length = cost[here] + lengths[k]

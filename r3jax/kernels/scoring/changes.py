@@ -33,7 +33,7 @@ _ONE = np.float32(1.0)
 
 
 @kernel
-def _shown_rows(before, after):
+def _visible_rows(before, after):
     """Gathers the rows that the views show: each of them adds to the count of just these."""
     rows, num = np.empty(after.shape[0] + 1, np.int32), 0
     for row in range(after.shape[0]):
@@ -54,11 +54,11 @@ def _find_set(items, bits, chosen):
 
 
 @kernel
-def _known(rows, shown, is_pairwise):
+def _known(rows, visible, is_pairwise):
     """Gathers what R needs to know of some rows, once for all positions."""
-    voxels = empty_voxels(shown.shape[0], rows.visited.shape[0])
-    for j in range(shown.shape[0]):
-        row = np.int64(shown[j])
+    voxels = empty_voxels(visible.shape[0], rows.visited.shape[0])
+    for j in range(visible.shape[0]):
+        row = np.int64(visible[j])
         delta = consistency(rows.counts[row], rows.m2[row], is_pairwise)
         x, y, z = center_of(rows.key, row, rows.voxel_size)
         voxels.known[X, j], voxels.known[Y, j], voxels.known[Z, j] = x, y, z
@@ -123,17 +123,17 @@ def changes(before, after, cells, seen, positions, focals, forms, tables, result
         results: written; sums of 1 - R after less before, and numbers of cells that are no longer
             unexplored [P, B].
     """
-    shown = _shown_rows(before.counts, after.counts)
-    was, now = _known(before, shown, forms.is_pairwise), _known(after, shown, forms.is_pairwise)
+    visible = _visible_rows(before.counts, after.counts)
+    was, now = _known(before, visible, forms.is_pairwise), _known(after, visible, forms.is_pairwise)
     explored = unexplored_of(cells)
-    chosen = np.empty(max(shown.shape[0], explored.numbers.shape[0]) + 1, np.int32)
+    chosen = np.empty(max(visible.shape[0], explored.numbers.shape[0]) + 1, np.int32)
     sums, scratch = np.empty(results[0].shape[1], np.float64), new_scratch()
     old = np.empty(CHUNK, np.float32)
     for i in range(positions.shape[0]):
         position = positions[i, 0], positions[i, 1], positions[i, 2]
         for bin in range(sums.shape[0]):
             sums[bin], results[1][i, bin] = 0.0, 0.0
-        num = _find_set(shown, seen[0][i], chosen)
+        num = _find_set(visible, seen[0][i], chosen)
         _add_voxels(
             position, focals[i], chosen, num, was, now, forms.is_kappa_one, tables, scratch, old,
             sums,

@@ -375,8 +375,8 @@ def _row(table, i, begin):
 
 
 @inlined_fused
-def _ask_for_texture(floats, wholes, k, row, ray, hit):
-    """Writes what the filtered color of a texture depends on."""
+def _queue_texture(floats, wholes, k, row, ray, hit):
+    """Queues a texture lookup: stores its inputs in the table of the block."""
     texture, u, v, path, direction, mirror = hit
     wholes[RAY + k], wholes[TEXTURE + k] = ray, texture
     _put(floats, DIRECTION, k, direction)
@@ -390,13 +390,13 @@ def _ask_for_texture(floats, wholes, k, row, ray, hit):
 
 
 @inlined
-def _ask_for_light(lit, i, row, look, origin, direction, distance):
-    """Writes what the light at a hit depends on; `_turn` makes of it position and view."""
+def _queue_light(lit, i, row, shine, origin, direction, distance):
+    """Queues the light at a hit: stores its inputs, which `_turn` converts to position and view."""
     _put(lit, _POSITION, i, origin)
     _put(lit, _NORMAL, i, (row[12], row[13], row[14]))
     _put(lit, _VIEW, i, direction)
     lit[_DISTANCE + i] = distance
-    lit[_SPECULAR + i], lit[_SHININESS + i], lit[_EMISSION + i] = look
+    lit[_SPECULAR + i], lit[_SHININESS + i], lit[_EMISSION + i] = shine
 
 
 @inlined_fused
@@ -523,12 +523,12 @@ def _shade_all(
                         path = distance[i] + before[min(i, before.shape[0] - 1)]
                         mirror = _row(mirrors, min(i, mirrors.shape[0] - 1), 0)
                         hit = texture, u[i], v[i], path, direction, mirror
-                        _ask_for_texture(floats, wholes, textured, row, np.int32(i - first), hit)
+                        _queue_texture(floats, wholes, textured, row, np.int32(i - first), hit)
                         textured += 1
                     if has_lamps:
                         origin = _row(origins, min(i, origins.shape[0] - 1), 0)
-                        look = _row(materials, material, 3)
-                        _ask_for_light(lit, i - first, row, look, origin, direction, distance[i])
+                        shine = _row(materials, material, 3)
+                        _queue_light(lit, i - first, row, shine, origin, direction, distance[i])
             filter_block(floats, wholes, (texels, sizes, offsets), steps, textured)
             for k in range(textured):
                 ray = first + wholes[RAY + k]

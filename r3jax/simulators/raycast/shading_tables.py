@@ -151,8 +151,8 @@ def build_shading_tables(world: World, *, lighting: bool) -> ShadingTables:
     for k, material in enumerate(world.materials):
         if texture_of[k] >= 0:
             material_size[k] = atlas.sizes[texture_of[k]]
-        look = (material.specular, material.shininess, material.emission)
-        rows[k] = (*material.color, *look, texture_of[k], 0.0)
+        shine = (material.specular, material.shininess, material.emission)
+        rows[k] = (*material.color, *shine, texture_of[k], 0.0)
     faces = _face_table(world, material_size)
     colors = world.face_color
     colors = np.zeros((0, 9)) if colors is None else colors.reshape(-1, 9)

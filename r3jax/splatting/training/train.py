@@ -102,7 +102,7 @@ class FitResult(NamedTuple):
     """The fitted Gaussians."""
 
     history: History
-    """What was measured on the way."""
+    """Measurements during the training."""
 
     interrupted: bool
     """True if Ctrl-C ended it early; with a folder, it can be resumed."""
@@ -179,7 +179,7 @@ def fit(
         overwrite: delete the checkpoints of an earlier training in `folder`, just before the
             first step.
         checkpoint_every: steps between two checkpoints; there is always one at the end.
-        growth: views and Gaussians that join on the way; not with a folder, which holds the views
+        growth: views and Gaussians that join later; not with a folder, which holds the views
             of the beginning alone.
         on_progress: called every few steps.
 

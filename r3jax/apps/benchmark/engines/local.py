@@ -43,7 +43,7 @@ Report = Callable[[Event], None]
 
 
 _STAGE_EVERY = 0.5
-"""Stages are told at most this often [s]."""
+"""Minimum interval between reports of a stage [s]."""
 
 
 def run_here(cells: Sequence[Cell], root: Path, report: Report) -> None:
@@ -64,14 +64,14 @@ def run_in_processes(cells: Sequence[Cell], root: Path, report: Report, *, jobs:
     """Runs cells in `jobs` processes; each takes the next cell when it is free.
 
     Args:
-        cells: what to do.
+        cells: the cells to compute.
         root: folder of the benchmark.
-        report: told what happens.
+        report: called with every event.
         jobs: processes at a time, at least 1.
 
     Raises:
         ValueError: jobs below 1.
-        KeyboardInterrupt: Ctrl-C; the processes are ended, what is complete stays.
+        KeyboardInterrupt: Ctrl-C; the processes are ended; complete cells stay.
     """
     if jobs < 1:
         raise InputError(f"jobs must be at least 1, got {jobs}")

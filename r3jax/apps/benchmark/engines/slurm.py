@@ -1,10 +1,10 @@
 """Runs cells as an array job of a Slurm cluster, through submitit.
 
-A job that is preempted or runs out of time is put back into the queue by submitit and goes on
-with its cell: all that is complete lies in the benchmark's folder, which every node must see.
+A job that is preempted or runs out of time is requeued by submitit and resumes its cell. Complete
+results are in the benchmark's folder, which must be visible on every node.
 
-submitit asks `sacct` which jobs have ended, which fails on clusters without an accounting database:
-a job that was killed would be waited for without end. `squeue`, asked here, works on all of them.
+submitit polls `sacct` for jobs that have ended, which fails on clusters without an accounting
+database: it would wait for a killed job without end. `squeue`, used here, works on all of them.
 """
 
 import itertools
@@ -29,20 +29,20 @@ _ENDED = {
     "PREEMPTED",
     "TIMEOUT",
 }
-"""States in which nothing runs or waits to run. All others, as of a job that is requeued, pass."""
+"""States of jobs that have ended. All others are temporary, such as that of a requeued job."""
 
 _PATIENCE = 60.0
-"""A controller that does not answer within this time is asked again later [s]."""
+"""Timeout of a query to the controller; it is repeated later [s]."""
 
 
 def ended_jobs(job_ids: Iterable[str]) -> dict[str, str]:
     """Queries the Slurm queue for jobs that have ended, with their state and its reason.
 
     Args:
-        job_ids: as submitit has them: `12`, or `12_3` of an array.
+        job_ids: in submitit's form: `12`, or `12_3` of an array.
 
     Returns:
-        By id. Empty also when the controller does not answer: it may be back at the next look.
+        By id. Also empty if the controller does not respond: it may at the next poll.
 
     Raises:
         OSError: there is no `squeue`.
@@ -88,16 +88,15 @@ _TIMEOUT = 240
 _MAX_TIMEOUTS = 100
 """How often a job goes back into the queue: each time it gets further."""
 
-_LOOKS_PER_QUESTION = 6
-"""Results are looked for at each look, the queue is asked at every sixth: a controller has many
-users."""
+_POLLS_PER_QUERY = 6
+"""Number of polls of the results per query of the queue, as a controller has many users."""
 
 
 class CellJob:
-    """What runs on a node."""
+    """The task of a node."""
 
     def __call__(self, cell: Cell, root: Path) -> str:
-        """Does what is left of a cell; returns why it failed, or nothing."""
+        """Computes the rest of a cell; returns why it failed, or an empty string."""
         from r3jax.apps.benchmark.run_cell import run_cell
 
         try:
@@ -124,19 +123,19 @@ def run_on_cluster(
     """Submits an array job with one task per cell, and waits for all of them.
 
     Args:
-        cells: what to do.
+        cells: the cells to compute.
         root: folder of the benchmark, at the same path on every node.
-        report: told what happens.
+        report: called with every event.
         jobs: tasks at a time.
-        parameters: of `submitit.AutoExecutor.update_parameters`: `timeout_min`,
+        parameters: arguments of `submitit.AutoExecutor.update_parameters`: `timeout_min`,
             `slurm_partition`, `gpus_per_node`, ...
-        cluster: where submitit submits: `slurm`; `local` needs no cluster.
-        poll_every: seconds between two looks at the jobs.
+        cluster: cluster of submitit: `slurm`, or `local`, which needs none.
+        poll_every: interval of the polls [s].
 
     Raises:
         ImportError: submitit is not installed.
-        KeyboardInterrupt: Ctrl-C; the jobs go on, and another `r3jax benchmark` with the same
-            arguments collects what they have done.
+        KeyboardInterrupt: Ctrl-C; the jobs continue, and another `r3jax benchmark` with the same
+            arguments collects their results.
     """
     submitit = _submitit()
     root = Path(root).resolve()
@@ -160,15 +159,15 @@ def _wait_for(
     ended: Callable[[Iterable[str]], dict[str, str]],
     poll_every: float,
 ) -> None:
-    """Tells the end of each job of `waiting`, which holds cell and job by the job's id.
+    """Reports the end of each job in `waiting`: cell and job by the job's id.
 
-    A job that leaves a result has ended. One that left the queue without any may have a result
-    that a network file system does not show yet: it has failed at the next question.
+    A job with a result has ended. A job that left the queue without a result may have one that a
+    network file system does not show yet: it has failed if there is none at the next query.
     """
     before: dict[str, str] = {}
-    for look in itertools.count():
-        asks = look % _LOOKS_PER_QUESTION == 0
-        now = ended(waiting) if asks else {}
+    for poll in itertools.count():
+        queries = poll % _POLLS_PER_QUERY == 0
+        now = ended(waiting) if queries else {}
         for job_id, (cell, job) in tuple(waiting.items()):
             if job.paths.result_pickle.exists():
                 report(_end_of(cell, job))
@@ -179,7 +178,7 @@ def _wait_for(
             del waiting[job_id]
         if not waiting:
             return
-        before = now if asks else before
+        before = now if queries else before
         time.sleep(poll_every)
 
 

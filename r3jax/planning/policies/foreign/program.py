@@ -162,7 +162,7 @@ def _talk(
 
 
 def _read(stream: IO[bytes], count: int) -> bytes:
-    """Reads so many bytes.
+    """Reads exactly `count` bytes.
 
     Raises:
         EOFError: there are fewer.
