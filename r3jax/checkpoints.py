@@ -212,7 +212,7 @@ class _WithoutLoops:
     """Leaves out what arrays report that fail after the first one: Orbax has closed their loop."""
 
     def __init__(self, hook: Callable[[Any], Any]):
-        """Takes the hook that is told everything else."""
+        """Stores the hook that receives everything else."""
         self._hook = hook
 
     def __call__(self, unraisable: Any) -> None:

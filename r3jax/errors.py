@@ -1,4 +1,4 @@
-"""Errors about the input: what is wrong, where, and what to do.
+"""Errors about the input: the mistake, its place, and the remedy.
 
 Everything that this package refuses on purpose is an `InputError`, which the command line prints as
 one line. Any other `ValueError` is a bug, and keeps its traceback.

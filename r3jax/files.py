@@ -90,7 +90,7 @@ class _Opened(NamedTuple):
 
 @contextlib.contextmanager
 def _opened(folder: Path, *, make: bool = False) -> Generator[_Opened]:
-    """Opens a folder, below what is ours never through a link.
+    """Opens a folder; below our own folders never through a link.
 
     Raises:
         NotOursError: a link or a file is in the way.
@@ -152,7 +152,7 @@ def check_own(folder: Path, kind: Kind, remedy: str = "give another folder") -> 
 
     Args:
         folder: that is to be written.
-        kind: of what is to be written there.
+        kind: kind of the content to be written there.
         remedy: what the user can do.
 
     Raises:
@@ -240,7 +240,7 @@ def clear_partial(folder: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Makes a folder and those above it, below what is ours never through a link.
+    """Makes a folder and those above it; below our own folders never through a link.
 
     Raises:
         NotOursError: a link is in the way.

@@ -1,4 +1,4 @@
-"""Where pages are served: on this machine only, unless told otherwise."""
+"""Addresses at which pages are served: by default for this machine only."""
 
 import errno
 import socket

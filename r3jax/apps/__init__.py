@@ -1,1 +1,1 @@
-"""What is built on the flow, each by itself: audit, benchmark, viewer."""
+"""Applications built on the flow, independent of each other: audit, benchmark, viewer."""

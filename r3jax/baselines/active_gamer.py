@@ -63,7 +63,7 @@ _SLACK = 0.5
 """A candidate stands at most this far above or below its level [m]."""
 
 _BELOW_FLOOR = 0.02
-"""Share of the known free cells that may lie below what is called the floor: seen through
+"""Share of the known free cells that may lie below the floor: seen through
 windows, or put there by the sensor's noise."""
 
 

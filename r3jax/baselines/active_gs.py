@@ -258,7 +258,7 @@ def draw_views(
     """Draws up to `num_frontier` views of regions of interest; the others local, turned anyhow.
 
     Args:
-        situation: where the robot can go, and what is unexplored.
+        situation: paths of the robot, and the unexplored space.
         config: how many views.
         count: primitives of low confidence per cell, [X, Y, Z].
         normal_sum: sum of their normals, [3, X, Y, Z].

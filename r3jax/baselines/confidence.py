@@ -179,7 +179,7 @@ def _sight(
     distance = jnp.maximum(safe_norm(offset, axis=0), 1e-6)
     direction = offset / distance[None, :]
     R = frame.T_world_camera[:3, :3]
-    # All bits of float32: accelerators multiply matrices with fewer unless they are told.
+    # All bits of float32: accelerators multiply matrices with fewer by default.
     turned = jnp.matmul(R, groups.rgb_sum[index, :3].T, precision="highest")
     normal_sum = at(seen.normal_sum) + _unit(turned)
     # With this frame counted in: n is the normal as known after frame t.

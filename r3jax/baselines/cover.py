@@ -5,7 +5,7 @@
 
 with r the direction from the pixel's voxel to the camera (NBV-Gym, CVPR 2026, which takes the view
 of the lowest mean). Ours are 64 direction bins a voxel instead of 128 a primitive, and visibility
-is the map's on both sides. The published rule knows no unknown space; so that it can explore, U_G
+is the map's on both sides. The published rule has no unknown space; so that it can explore, U_G
 is added, weighted as in Active-GS. Every table must mention this.
 
 Shape symbols: C candidates; h w pixels; N rows of the map; W words of bins.
@@ -24,7 +24,7 @@ from r3jax.planning.policy import Situation
 from r3jax.scoring.terms import nearest_seen
 
 UNSEEN_WEIGHT = 1000.0
-"""Worth of a view that shows every cell of the grid, all unexplored (Active-GS)."""
+"""Utility of a view that shows every cell of the grid, all unexplored (Active-GS)."""
 
 
 class SeenBins(eqx.Module):

@@ -206,7 +206,7 @@ class FisherConfig(OnlineConfig):
     """Settings of `fisherrf`."""
 
     lambda2: float = 0.0
-    """The published rule knows no path."""
+    """Returns no cost: the published rule ignores the path."""
 
     criterion: Criterion = "ratio"
     """`ratio`: FisherRF. `d-opt`: sum of log(1 + H_v / (H + lambda)) (POp-GS)."""

@@ -160,7 +160,7 @@ class GaussMIConfig(OnlineConfig):
     """Settings of `gauss-mi`."""
 
     lambda2: float = 0.0
-    """The published rule knows no path."""
+    """Returns no cost: the published rule ignores the path."""
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@
     total   = utility / sum of utilities - lambda2 * path / sum of paths
 
 The paper's: visibility that depends on the direction, from all photos and what hides what in them;
-particles that stand for unexplored space and were never seen; a view's worth is the information
+particles that stand for unexplored space and were never seen; a view's utility is the information
 that it brings, which is the entropy of its rays, as the noise of any photo is alike.
 Our reading: surface elements are the map's voxels, opaque, and photos its direction bins; the
 particles are the unexplored cells of the coarse grid, of an opacity of their own in place of 0,
@@ -115,7 +115,7 @@ class RayEnds(eqx.Module):
 
 
 class Beliefs(eqx.Module):
-    """What is believed of things that no photo shows."""
+    """Beliefs about objects that no photo shows."""
 
     kappa: Float[Array, ""]
     """Fall of visibility with the angle."""
@@ -153,7 +153,7 @@ def entropy_of_views(
         camera: of the depth buffer that the rays were picked from.
         poses: of the views.
         max_range: rays go no farther [m].
-        beliefs: what is believed of things that no photo shows.
+        beliefs: beliefs about objects that no photo shows.
         num_bins: number of direction bins.
         num_steps: cells along the range, rounded up.
     """
@@ -178,7 +178,7 @@ def unknown_share(
 ) -> Float[Array, "h w"]:
     """Computes u: the probability that a ray's color comes from something in no photo."""
     passes = (1.0 - beliefs.cell_opacity) ** cells
-    # As a sum of what is small: 1 - passes (1 - unseen) would lose the digits of a known voxel.
+    # As a sum of small terms: 1 - passes (1 - unseen) would lose the digits of a known voxel.
     return (1.0 - passes) + passes * jnp.where(hit, unseen, 0.0)
 
 

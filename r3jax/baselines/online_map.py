@@ -1,7 +1,7 @@
 """A Gaussian map that grows with every key frame, and the policies that train it while they plan.
 
 After a frame: Gaussians are born where the map renders it wrongly, some steps of Adam follow over
-this and earlier frames, and now and then what is faint goes. All randomness follows from the key
+this and earlier frames, and faint ones are pruned now and then. All randomness follows from the key
 of the run and the number of key frames, so that the same frames make the same map.
 
 Births and rows that are added or dropped are worked out on the host. Settings are one set per
@@ -106,7 +106,7 @@ class MapSettings:
     """Key frames between two prunings."""
 
     prune_opacity: float = 0.1
-    """What is fainter than this is pruned, and what no key frame sees any more."""
+    """Opacity below which Gaussians are pruned, as are those that no key frame sees any more."""
 
 
 DISCS = MapSettings()
@@ -449,7 +449,7 @@ def rows_in_view(
 
     Those within the planes of the image's edges, with room for the largest Gaussian, for what
     the training may move it by, and for what the image of the smallest one is dilated by. The
-    planes are exact, the rest errs to the safe side: what is left out would have no gradient.
+    planes are exact, the rest errs to the safe side: the omitted ones would have no gradient.
 
     Args:
         means: centers [m].
@@ -561,7 +561,7 @@ def drawn_batch(error: np.ndarray, settings: MapSettings, rng: np.random.Generat
     Args:
         error: last error of each key frame [F].
         settings: how many of each, and whether by their errors.
-        rng: what is drawn.
+        rng: random numbers.
     """
     num = len(error)
     recent = list(range(max(0, num - settings.recent), num))
@@ -626,7 +626,7 @@ def supported_by(online: OnlineMap, number: int) -> Bool[np.ndarray, " n"]:
 
 
 def _pruned(online: OnlineMap, settings: MapSettings) -> OnlineMap:
-    """Drops what is faint, and what no key frame sees any more; the rest moves up."""
+    """Prunes faint Gaussians and those that no key frame sees any more; the rest moves up."""
     opaque = jax.nn.sigmoid(online.scene.opacity_logits) >= settings.prune_opacity
     is_seen = np.zeros(online.scene.capacity, dtype=bool)
     for number in range(len(online.frames)):

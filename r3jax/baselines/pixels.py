@@ -139,7 +139,7 @@ def _score(
         pose, (item, unexplored) = one
         return value(pixel_view(voxels, pose, config, item, unexplored, rows))
 
-    # All views in one call of the backend; what is made of their pixels, one after the other.
+    # All views in one call of the backend; their pixels are processed one view after the other.
     return jax.lax.map(look, (poses, jax.vmap(shown)(poses)))
 
 

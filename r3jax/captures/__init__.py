@@ -1,1 +1,1 @@
-"""A capture as frames of one world: how it is read and mapped, and what is wrong with it."""
+"""Captures as frames of one world: reading, mapping, and finding faults."""

@@ -374,7 +374,7 @@ def _of_images(images: PosedImages, name: str) -> Source:
     stride = _stride(images.lenses)
     with naming(images.path):
         for lens in set(images.lenses):
-            sampling_table(lens, stride)  # refuses a lens that it does not know
+            sampling_table(lens, stride)  # refuses unknown lenses
     labels = tuple(path.name for path in images.image_paths)
     has_images = images.has_images
     remark = images.remark

@@ -104,6 +104,6 @@ _usual_format = warnings.formatwarning
 
 
 def _keep_compilations() -> None:
-    """Lets the second start find what the first one compiled, unless JAX is told otherwise."""
+    """Enables the compilation cache, unless JAX is configured otherwise."""
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder() / "jax"))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")

@@ -9,7 +9,7 @@ from pathlib import Path
 from r3jax.errors import InputError
 
 _BLANKS = "\n\u00a0"
-"""What is not printable by name, but harmless."""
+"""Characters that are not printable by name, but harmless."""
 
 
 def check_viser() -> None:

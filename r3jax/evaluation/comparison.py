@@ -20,7 +20,7 @@ import numpy as np
 from r3jax.errors import InputError
 
 RESAMPLES = 1000
-"""Drawn for an interval unless told."""
+"""Default number of draws for an interval."""
 
 LEVEL = (2.5, 97.5)
 """Percentiles of the resamples that bound an interval."""

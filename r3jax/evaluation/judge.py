@@ -204,7 +204,7 @@ def judge(
         model: the model.
         test: the views that judge.
         settings: how.
-        on_progress: told what happens.
+        on_progress: progress callback.
 
     Raises:
         ValueError: a view or the model cannot be read, or views that cannot be compared.

@@ -197,7 +197,7 @@ def _next_frame(
         mission: settings of the run.
         leg: the path.
         stages: seconds that stages took so far.
-        before: what is charged for the time until the camera begins to fly [s].
+        before: time charged until the camera begins to fly [s].
     """
     pose = leg.decision.T_world_camera
     if not leg.is_last:
@@ -271,7 +271,7 @@ def _look(
         T_world_camera: pose of the frame, [4, 4].
         leg: the path to it; None: the camera is there.
         stages: seconds that stages took so far.
-        before: what is charged for the time until the camera begins to fly [s].
+        before: time charged until the camera begins to fly [s].
     """
     captured = leg is not None and not leg.is_last
     # A decision is recorded with the first frame of its path.

@@ -1,8 +1,8 @@
 """Taken views: the stored form of a frame, and its row in the trace.
 
-The map integrates what is recorded: the loop rounds a frame to its stored form (8-bit color, 16-bit
-depth) *before* it enters the map, so that a map rebuilt from the files is the same map, bit for
-bit.
+The map integrates the recorded data: the loop rounds a frame to its stored form (8-bit color,
+16-bit depth) *before* it enters the map, so that a map rebuilt from the files is the same map, bit
+for bit.
 
 Shape symbols: H, W image size; K waypoints.
 """

@@ -232,7 +232,7 @@ _LAST_ROW_TOLERANCE = 1e-5
 
 
 def rigid_error(T: np.ndarray) -> str | None:
-    """Describes what is wrong with a 4x4 pose; None if it is rigid and finite. On the host."""
+    """Describes the mistake in a 4x4 pose; None if it is rigid and finite. On the host."""
     if T.shape != (4, 4):
         return f"a pose is a 4x4 matrix, got shape {T.shape}"
     # First: every comparison below is False for NaN, and the pose would pass.

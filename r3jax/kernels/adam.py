@@ -61,7 +61,7 @@ def _step(k, at, x, g, m, v, rate, share, corrections):
 
 @kernel
 def _steps(first, last, x, g, m, v, rate, share, corrections):
-    """Moves a range of numbers; what is no whole vector goes by way of a spare one."""
+    """Copies a range of numbers; a partial vector is copied through a spare one."""
     period, at = rate.shape[0], first % rate.shape[0]
     whole = first + (last - first) // 16 * 16
     for k in range(first, whole, 16):

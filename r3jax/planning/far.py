@@ -1,7 +1,7 @@
 """Far places: tiles, paths back to them, and views left for later.
 
 A planner that was started without bounds, or with `MappingConfig(tiles=True)`, holds a block of
-tiles (`mapping.tiles`): policies draw and score in it as in a house, and know of nothing else.
+tiles (`mapping.tiles`): policies draw and score in it as in a house, and depend on nothing else.
 Goals lie so far within it that all that they may see is at hand. Views that were scored and not
 taken are kept when the robot goes away: they are scored once more when they leave the block, and
 nothing changes there until it comes back. Each decision weighs them against the views on offer,
@@ -53,7 +53,7 @@ _RETURN = 1.0
 
 
 _KINDS = {"log_odds": "<f4", "looks": "<i4"}
-"""What is kept of cells, and in which numbers."""
+"""Stored fields of cells, and their types."""
 
 
 class Views(NamedTuple):
@@ -90,7 +90,7 @@ def _joined(a: Views, b: Views) -> Views:
 
 @dataclass(frozen=True, eq=False)
 class Far:
-    """What is known of the world beyond the block at hand, and what is drawn into each block."""
+    """The world beyond the block at hand, and the marks that are drawn into each block."""
 
     tiles: Tiles
     """Voxels and cells of all other tiles."""
@@ -177,7 +177,7 @@ def first_far(
     box: np.ndarray,
     starts: Sequence[np.ndarray] = (),
 ) -> Far:
-    """Makes what is known of far places before the first frame: nothing."""
+    """Makes an empty record of far places, before the first frame."""
     if box.shape != (2, 3) or not np.all(box[1] > box[0]):  # NaN, too
         raise InputError(
             "bounds are a lower and an upper corner, [2, 3] in meters, each upper value above the "
@@ -226,7 +226,7 @@ Known = tuple[MapState, OccupancyGrid, PlannerState, Far]
 
 
 def moved_to(known: Known, policy: GreedyPolicy, position: np.ndarray) -> Known:
-    """Moves what is at hand to a position [3] [m]; the same if that lies in its middle."""
+    """Moves the block to a position [3] [m]; unchanged if that lies in its middle."""
     map_state, grid, memory, far = known
     if middle_for(far.tiles, position) == far.tiles.middle:
         return known
@@ -302,9 +302,9 @@ def weigh_far(
     """Weighs views left for later against a decision; returns the better one.
 
     Args:
-        far: what is known of far places, the path to here included.
+        far: record of far places, including the path to here.
         policy: which weighs.
-        decision: on what is at hand; None: there is nothing to go to.
+        decision: decision within the block; None if there is no goal.
         T_here: pose of the robot, [4, 4].
     """
     here = T_here[:3, 3]

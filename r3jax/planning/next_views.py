@@ -88,7 +88,7 @@ def next_views(
     positions = _positions_in(grid, safe, config) if checked is None else checked[:, :3, 3]
     # Without a safe cell nothing is reachable, and the mask would leave no unexplored cells.
     known_grid = mask_unexplorable(grid, safe) if safe.any() else grid
-    # Gathered once: taking views changes the statistics, not what is in range.
+    # Gathered once: taking views changes the statistics, not the rows in range.
     places = jnp.asarray(positions, dtype=jnp.float32)
     voxels, cells, _ = gather_in_range(state, known_grid, places, config.scoring)
     if checked is None:

@@ -147,7 +147,7 @@ def start(
 
 
 def at_hand(planner: Planner, position: np.ndarray) -> Planner:
-    """Moves what is at hand to a position [3] [m]; the same planner if it holds no tiles.
+    """Moves the block to a position [3] [m]; the same planner if it holds no tiles.
 
     For those who look at a planner's map round a place; `observe` and `decide` do it by themselves.
     """
@@ -202,7 +202,7 @@ def decide(
     """Chooses the next view and the path to it.
 
     Args:
-        planner: what is known.
+        planner: the state.
         T_world_camera: where the camera is, [4, 4].
         key: random key; a new one for each decision.
 
@@ -233,7 +233,7 @@ def _decide_far(
     decision: Decision | None,
     info: PlanInfo,
 ) -> tuple[Decision | None, Planner, PlanInfo]:
-    """Weighs views that were left for later against a decision on what is at hand."""
+    """Compares views that were left for later with a decision within the block."""
     assert before.far is not None
     policy, here = cast(GreedyPolicy, before.policy), pose[:3, 3]
     far = arrived(before.far, here)
@@ -453,7 +453,7 @@ def follow(planner: Planner, T_world_camera: np.ndarray, waypoints: np.ndarray) 
     """Notifies the policy of a path that another one chose, before the robot follows it.
 
     Args:
-        planner: what is known.
+        planner: the state.
         T_world_camera: where the latest view was taken, [4, 4].
         waypoints: the path to the next one, [K, 3] [m].
     """

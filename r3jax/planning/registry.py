@@ -38,7 +38,7 @@ def register_policy(policy_class: PolicyClass) -> PolicyClass:
 
 
 def policy_names() -> tuple[str, ...]:
-    """Lists the names that `make_policy` knows."""
+    """Lists the names for `make_policy`."""
     return known_names()
 
 

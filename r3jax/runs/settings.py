@@ -47,7 +47,7 @@ def config_of(run: Run) -> ExplorationConfig:
     """Reads the settings of a run's loop.
 
     Raises:
-        RunError: a setting that this version does not know, or cannot work with.
+        RunError: a setting that is unknown to this version, or invalid.
     """
     try:
         # Unknown settings may affect the map: they are refused, not ignored.
@@ -81,7 +81,7 @@ def planner_config_of(run: Run) -> PlannerConfig:
     """Reads the settings of a run's policy.
 
     Raises:
-        RunError: a setting that this version does not know, or cannot work with.
+        RunError: a setting that is unknown to this version, or invalid.
     """
     try:
         settings = dict(run.header.policy["settings"])

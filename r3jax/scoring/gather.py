@@ -38,7 +38,7 @@ def gather_in_range(
     # The box round all positions: one test per voxel, however many candidates there are.
     places = np.asarray(positions)
     low, high = places.min(axis=0), places.max(axis=0)
-    # Counted first, on the host: the shapes of what is gathered must be known beforehand.
+    # Counted first, on the host: the shapes of gathered arrays must be static.
     counts = np.asarray(_count_near(state, grid, low, high, config))
     sizes = _sizes(int(counts[0]), int(counts[1]), state.capacity, grid.log_odds.size)
     return _gather_near(state, grid, low, high, config, sizes)

@@ -149,7 +149,7 @@ def cached_panorama(
     config: ScoringConfig,
     allowed: Bool[Array, " B"] | None = None,
 ) -> tuple[Panorama, PanoramaCache]:
-    """Computes `panorama_of`, and caches what is needed to score it again."""
+    """Computes `panorama_of`, and caches the data for scoring it again."""
     view, num_bins = panorama_view(position, config), config.panorama_bins
     deficits, unexplored, *seen = sums_and_seen(voxels, cells, view, camera.focal, config, num_bins)
     bins = deficits + config.lambda1 * unexplored

@@ -1,7 +1,8 @@
 """A utility of a view that gradients can climb: smooth in position and direction.
 
-`view_utility` counts what is in the image and not hidden. Its derivative ignores that points enter
-and leave the view, and that kappa changes between 1 and 2. Here, near the pose that it is made for,
+`view_utility` counts points that are in the image and not hidden. Its derivative ignores that
+points enter and leave the view, and that kappa changes between 1 and 2. Here, near the pose that it
+is made for,
 
     U(c, R) = sum over points p of  n_p w_p(c) F_p(c, R) D_p(c)
 

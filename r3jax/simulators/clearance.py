@@ -226,7 +226,7 @@ def _cast(scene: TriangleScene, origins: np.ndarray, directions: np.ndarray) -> 
 
 
 def _at_eye_height(points: np.ndarray, scene: TriangleScene) -> np.ndarray:
-    """Moves points to eye height above what is below them; drops those with nothing below."""
+    """Moves points to eye height above the surface below; drops those without one."""
     down = _cast(scene, points, np.array([[0.0, 0.0, -1.0]])).distance
     points, down = points[np.isfinite(down)], down[np.isfinite(down)]
     floor = points - np.stack([np.zeros_like(down)] * 2 + [down], axis=1)

@@ -529,7 +529,7 @@ def agent_from_pose(
 
 
 def horizontal_fov_deg(camera: Camera) -> float:
-    """Computes the horizontal field of view [deg] by which Habitat knows a camera.
+    """Computes the horizontal field of view [deg] that defines a camera in Habitat.
 
     Raises:
         ValueError: Habitat cannot show this camera's image: its pixels are not square, or the

@@ -97,7 +97,7 @@ def load_views(frames: Iterable[Frame], resolution: int | None = None) -> Views:
         The views in the order of the frames.
 
     Raises:
-        TypeError: one frame alone, or what is none.
+        TypeError: one frame alone, or another type.
         ViewsError: no frames, or frames of different sizes.
         ValueError: a resolution below 1.
     """

@@ -1,1 +1,1 @@
-"""Files that anybody may have written: what is checked before any reader believes them."""
+"""Checks of foreign files before a reader trusts them."""

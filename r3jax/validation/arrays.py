@@ -28,7 +28,7 @@ def read_npz(path: str | Path, types: Mapping[str, str]) -> dict[str, np.ndarray
 
     Raises:
         ForeignFileError: not an NPZ, cut off, packed like a bomb; arrays that are missing, of
-            another kind, larger than what is stored of them, or not finite.
+            another kind, larger than their stored bytes, or not finite.
         OSError: missing, or not permitted.
     """
     size = check_regular(path)

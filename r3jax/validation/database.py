@@ -1,7 +1,7 @@
 """Reading SQLite databases of strangers: plain tables only, and no more than fits.
 
 A view, a virtual table or a generated column computes its rows while it is read: without end, or
-900 MB each out of a file of 20 kB. So only what is stored is read, and queries have limits.
+900 MB each out of a file of 20 kB. So only stored data is read, and queries have limits.
 """
 
 import sqlite3
@@ -31,9 +31,9 @@ _STEPS = 100_000
 
 
 def check_database(path: str | Path, tables: Collection[str] = ()) -> None:
-    """Refuses an SQLite database that is shorter than it says, or that computes what is read.
+    """Refuses an SQLite database that is shorter than it declares, or that computes its content.
 
-    SQLite itself may read what is missing as zeros, or not notice (its file format, 1.3: pages in
+    SQLite itself may read missing pages as zeros, or not notice (its file format, 1.3: pages in
     the header, to be trusted where the version that wrote them is that of the last change).
 
     Args:

@@ -1,6 +1,6 @@
-"""What is wrong with a file, or with a name that somebody typed, in words.
+"""Describes mistakes in a file or in a name that was typed.
 
-The reader that knows which file it is adds its name.
+The reader adds the name of the file.
 """
 
 import difflib

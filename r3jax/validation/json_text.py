@@ -1,7 +1,7 @@
 """JSON without what Python's reader lets through, and records from it.
 
 NaN, doubled keys and endless nesting are refused. msgspec's reader is stricter than Python's, but
-lets a doubled key and whole numbers of any length through, and cannot be told otherwise; Python's
+accepts repeated keys and integers of any length, without an option against it; Python's
 has a hook for each. msgspec's conversion to dataclasses ignores fields that they do not have, takes
 numbers that are not finite, names one missing field where several are, and does not quote what it
 found; so every field of a record is checked here against the type that its annotation names.
@@ -177,7 +177,7 @@ def check_type(name: str, value: Any, hint: Any) -> None:
     """Refuses a value from JSON that is not of a type.
 
     Raises:
-        ForeignFileError: it is not; says which name, what was expected and what is there.
+        ForeignFileError: it is not; names the field, the expected type and the found one.
     """
     if not _is(value, hint):
         expected = getattr(hint, "__name__", str(hint)) if not typing.get_args(hint) else str(hint)

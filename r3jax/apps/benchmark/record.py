@@ -198,7 +198,7 @@ def _read_record(path: Path) -> dict[str, Any]:
     except ValueError as error:
         raise InputError(
             f"{path} is no record of a benchmark ({error!s:.300}): delete it and start the "
-            "benchmark again, it makes what is missing"
+            "benchmark again: it computes the missing ones"
         ) from None
 
 

@@ -87,7 +87,7 @@ class Table:
     """Lines of one method follow each other."""
 
     notes: tuple[str, ...]
-    """Sentences below the table: terms, seeds, what is missing."""
+    """Sentences below the table: terms, seeds, missing cells."""
 
 
 def metric_named(name: str) -> Metric:

@@ -64,7 +64,7 @@ def free_space_views(grid: OccupancyGrid, num: int) -> np.ndarray:
     """Selects the first `num` views of a fixed sequence over the grid that stand in possible cells.
 
     Args:
-        grid: what is known.
+        grid: free, occupied and unexplored space.
         num: views at most; there are fewer where hardly anything is open.
 
     Returns:
@@ -207,7 +207,7 @@ def is_done(planner: Planner, goal: str, camera: Camera | None = None) -> bool:
     Do not call it at every decision: it takes as long as scoring a hundred views.
 
     Args:
-        planner: what is known.
+        planner: map and grid.
         goal: such as `psnr:25`, the mean of views throughout the place [dB], or `psnr:20@p10`, all
             but the worst tenth of them.
         camera: of those views; None: the planner's.

@@ -260,7 +260,7 @@ def _parse(data: bytes) -> Calibration:
     errors = {name: tuple(sorted(found["errors"].get(name, ()))) for name in STATISTICS}
     missing = [name for name, sizes in errors.items() if not sizes]
     if missing:
-        raise ForeignFileError(f"the errors of {', '.join(missing)} are not told")
+        raise ForeignFileError(f"the errors of {', '.join(missing)} are missing")
     location, log_scale, residuals = (tuple(found[name]) for name in list(_KINDS)[1:4])
     return Calibration(PsnrModel(location, log_scale, residuals), errors, found["source"])
 

@@ -89,7 +89,7 @@ class ExploreEnv(gymnasium.Env[Any, Any]):
         """Opens the scene.
 
         Args:
-            scene: a name that `open_scene` knows: an embedded scene, a mesh file, a Habitat scene.
+            scene: a name for `open_scene`: an embedded scene, a mesh file, a Habitat scene.
             actions: what an action is.
             reward: what an action is paid for.
             policy: draws the candidates, and weighs them for `info`.

@@ -206,7 +206,7 @@ class Observation:
 
 @dataclass(frozen=True)
 class SharedFrame:
-    """A frame that all members know."""
+    """A frame in the common map."""
 
     frame: Frame
 

@@ -195,7 +195,7 @@ class Timeline:
         return self._before(step)
 
     def replay(self, step: int) -> Iterator[tuple[int, int]]:
-        """Goes to the state after view `step`, frame by frame: what is left undone takes longer.
+        """Goes to the state after view `step`, one frame per iteration.
 
         Yields:
             Before each frame, how many have been replayed and how many there are to replay.
@@ -409,7 +409,7 @@ class LiveStory:
         camera: Camera,
         earlier: Run | None = None,
     ):
-        """Knows the views that were recorded before, if any, but not their map.
+        """Begins with the views that were recorded before, if any, without their map.
 
         Args:
             camera: of every view.

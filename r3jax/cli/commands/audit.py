@@ -92,7 +92,7 @@ def _audit(
         options: of the command line.
         source: the capture.
         path: frames to evaluate instead of its own.
-        progress: where progress is told.
+        progress: display of the progress.
 
     Raises:
         InputError: a folder that holds something else.

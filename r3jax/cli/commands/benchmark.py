@@ -144,7 +144,7 @@ def _read(options: BenchmarkOptions, path: Path) -> Submission:
 
 
 def _check_submissions(console: Console, options: BenchmarkOptions) -> int:
-    """Reports for each file what is wrong with it, or how many frames are in order."""
+    """Reports the problems of each file, or the number of its valid frames."""
     code = 0
     for path in options.submissions.submission:
         try:

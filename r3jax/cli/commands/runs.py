@@ -38,7 +38,7 @@ from r3jax.runs.settings import config_of
 
 
 def run_info(options: InfoOptions) -> int:
-    """Prints a run, a recording, or what is installed.
+    """Prints a run, a recording, or the installed versions.
 
     Raises:
         InputError, ValueError, OSError: neither a run nor a recording, or a broken one.

@@ -50,7 +50,7 @@ class ReplayOptions:
     """A run folder."""
 
     def __post_init__(self) -> None:
-        """Refuses what is no run."""
+        """Refuses a path that is no run."""
         check_run(self.path)
 
 
@@ -101,7 +101,7 @@ class ForecastOptions:
     """Plot the forecast along the run into this PNG."""
 
     def __post_init__(self) -> None:
-        """Refuses what is no run."""
+        """Refuses a path that is no run."""
         check_run(self.path)
 
 

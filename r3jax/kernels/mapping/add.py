@@ -45,7 +45,7 @@ _LOWEST, _HIGHEST = np.float32(-INDEX_LIMIT), np.float32(INDEX_LIMIT - 1)
 def _copy_rows(depth, first, block):
     """Copies depths of a block's rows and of those around it, with a column more on both sides.
 
-    The border repeats its own pixels; what is no measurement is 0, what is out of range far.
+    The border repeats its own pixels; no measurement is 0, out of range is far.
     """
     height, width = depth.shape
     for k in range(block.shape[0]):
@@ -429,7 +429,7 @@ def _combine(rows, mean, row, red, green, blue):
 
 @inlined
 def _prefetch_row(rows, mean, row):
-    """Prefetches what is known of a row, which lies in as many places as it has numbers."""
+    """Prefetches a row. Columns are separate arrays, so each is its own cache line."""
     if row < rows.counts.shape[0]:
         for word in range(rows.visited.shape[0]):
             prefetch(rows.visited[word], row)

@@ -173,7 +173,7 @@ def _mark_all(visited, resolution, key, camera, frame, is_visible, bins, lattice
 
 @inlined_fused
 def _is_open(depth, pixel, z, focal, size, slack):
-    """Checks whether most of a voxel's footprint shows what is behind it, and nothing shows it."""
+    """Checks whether most pixels of a voxel's footprint see through it, and none shows it."""
     height, width = depth.shape
     half = np.int64(math.ceil(focal * _HALF_DIAGONAL * size / z)) + 1
     step = 1 + 2 * half // constants.MOST_SAMPLES

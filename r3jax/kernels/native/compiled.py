@@ -79,7 +79,7 @@ def kept_on_disk(compiled: Callable[[bool], Any]) -> Any:
     """Compiles with Numba's cache, or without it where no folder for it can be written.
 
     Args:
-        compiled: told whether to cache.
+        compiled: compiler, with or without a cache.
     """
     try:
         return compiled(True)
@@ -170,7 +170,7 @@ def in_wide_vectors(typingctx: Any) -> Any:
     """
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        # llvmlite knows no attributes but LLVM's own keywords, and refuses to add this one.
+        # llvmlite has only the attributes that are LLVM's keywords, and refuses to add this one.
         set.add(builder.function.attributes, '"prefer-vector-width"="512"')
         return context.get_dummy_value()
 

@@ -7,7 +7,7 @@ optimized once, together with the small ones that it calls. Large ones stand apa
 to what calls them when the address of the whole is needed.
 """
 
-# Numba's compiler has no types, and what is private in it may change with its version.
+# Numba's compiler has no types, and its private parts may change with its version.
 # pyright: reportPrivateUsage=false, reportUnknownMemberType=false, reportUnknownVariableType=false
 # pyright: reportUnknownArgumentType=false, reportAttributeAccessIssue=false
 

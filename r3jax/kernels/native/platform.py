@@ -45,7 +45,7 @@ def call_of_many(
     """Computes `formula(shared, item)`, so that its `vmap` is one kernel call on CPUs.
 
     Elsewhere it is the formula in batches, whose memory does not grow with the number of items.
-    Where what is shared differs as well, one call follows the other.
+    If the shared arguments differ as well, the calls are made one after the other.
 
     Args:
         kernel: of many items, whose arrays have a leading axis; gives arrays with the same axis.
@@ -53,7 +53,7 @@ def call_of_many(
         formula: of one item.
         shared: such as the map.
         item: such as a view.
-        num_rows: of what is shared.
+        num_rows: rows of the shared map.
     """
 
     def by_formula(shared: Any, items: Any) -> Any:

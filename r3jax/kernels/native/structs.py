@@ -29,7 +29,7 @@ OFFSETS = {
 """Bytes from the start of a struct `XLA_FFI_...` to a field; with two dots, of a struct in it."""
 
 VALUES = {"XLA_FFI_API_MAJOR": 0, "XLA_FFI_Extension_Metadata": 1}
-"""Constants that handlers know."""
+"""Constants of the handlers."""
 
 _SIZES = {"size_t": 8, "int64_t": 8, "int": 4}
 """Bytes of types; a pointer takes 8, an enumeration 4."""

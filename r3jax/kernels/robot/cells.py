@@ -113,7 +113,7 @@ def nearest_in_ring(mask, middle, reach, cell_size, closest, farthest, most):
     Args:
         mask: [X, Y, Z] bool.
         middle: index of a cell, [3].
-        reach: half the edge of the window that is asked [cells].
+        reach: half the edge of the window [cells].
         cell_size: edge of a cell [m].
         closest: least distance between centers [m].
         farthest: greatest distance [m].

@@ -55,7 +55,7 @@ def _find_set(items, bits, chosen):
 
 @kernel
 def _known(rows, visible, is_pairwise):
-    """Gathers what R needs to know of some rows, once for all positions."""
+    """Gathers the inputs of R for some rows, once for all positions."""
     voxels = empty_voxels(visible.shape[0], rows.visited.shape[0])
     for j in range(visible.shape[0]):
         row = np.int64(visible[j])

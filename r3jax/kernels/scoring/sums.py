@@ -1,4 +1,4 @@
-"""What views would show that renders badly, and what is unexplored, summed by direction."""
+"""Sums the deficit and the unexplored cells that views would show, by direction."""
 
 # Kernels have the types that Numba infers where they are called; annotations it would not read.
 # pyright: reportMissingParameterType=false, reportUnknownParameterType=false
@@ -82,7 +82,7 @@ class Tables(NamedTuple):
 
 
 class Sums(NamedTuple):
-    """What is written of each view."""
+    """Results of each view."""
 
     deficits: Any
     """Sums of 1 - R [P, B]."""

@@ -39,7 +39,7 @@ RANGE, INSIDE = 3 * CHUNK, 4 * CHUNK
 seen."""
 
 DELTAS, LOG_DELTAS, SHARPNESS = 5 * CHUNK, 6 * CHUNK, 7 * CHUNK
-"""What is known of the voxels, see `voxels`: the last is the best resolution."""
+"""Columns of the voxels, see `voxels`; the last is the best resolution."""
 
 ANGLES = 8 * CHUNK
 """Floats that all this of a chunk takes."""
@@ -117,7 +117,7 @@ def look_from(visited, at, lattice, direction):
             q_x, q_y, q_z = lattice[k, 0], lattice[k, 1], lattice[k, 2]
             cosine = q_x * x + q_y * y + q_z * z
             best = max(best, cosine)
-            # Added, not chosen between: what is not ahead is no bound of the box.
+            # Added, without a branch: corners that are not ahead do not bound the box.
             apart = _ZERO if cosine > _ZERO else _INFINITE
             a = q_x * a_x + q_y * a_y
             b = q_x * b_x + q_y * b_y + q_z * b_z

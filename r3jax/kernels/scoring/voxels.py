@@ -1,4 +1,4 @@
-"""What is known of the voxels near some views, sorted into bricks, with what R needs of each."""
+"""Gathers the voxels near some views into bricks, with the inputs of R for each."""
 
 # Kernels have the types that Numba infers where they are called; annotations it would not read.
 # pyright: reportMissingParameterType=false, reportUnknownParameterType=false
@@ -19,7 +19,7 @@ _ZERO = np.float32(0.0)
 
 
 class Voxels(NamedTuple):
-    """What is known of the voxels near some views."""
+    """The voxels near some views."""
 
     known: Any
     """Centers [m], delta, log2 of it, and best resolution [px/m], one a row [SIZE, n]."""
@@ -40,7 +40,7 @@ _ROW, _WORDS = 6, 7
 """Parts of a record beside those: the row of the map, and where the words of bins begin."""
 
 _CLASSES = 8
-"""Numbers of directions that are told apart: 0 to 6, and more."""
+"""Classes of the number of directions: 0 to 6, and more."""
 
 
 @inlined
@@ -108,7 +108,7 @@ def sorted_voxels(rows, views, is_valid, forms, workers):
 
 @parallel_kernel
 def _gather(slots, bricks, rows, forms, workers, voxels):
-    """Gathers what is known of voxels in the order of the bricks.
+    """Gathers voxels in the order of the bricks.
 
     Args:
         slots: of every row of the map, -1: none [N].
@@ -169,7 +169,7 @@ def _gather_near(rows, views, is_valid, layout, forms, begins, ends, voxels):
 
 @kernel
 def _gather_share(rows, views, is_valid, layout, forms, begin, end, voxels):
-    """Gathers what is known of the rows from `begin` to `end` that some view may show.
+    """Gathers the rows from `begin` to `end` that some view may show.
 
     Returns:
         Where the voxels end; they begin where the rows do.

@@ -84,7 +84,7 @@ def _quat_gradient(g, unit, inverse, g_quat):
     b = TWO * (y * (g[1] + g[3]) + z * (g[2] + g[6]) - TWO * x * (g[4] + g[8]) + w * (g[7] - g[5]))
     c = TWO * (x * (g[1] + g[3]) + z * (g[5] + g[7]) - TWO * y * (g[0] + g[8]) + w * (g[2] - g[6]))
     d = TWO * (x * (g[2] + g[6]) + y * (g[5] + g[7]) - TWO * z * (g[0] + g[4]) + w * (g[3] - g[1]))
-    # Only what is across the quaternion turns it; its length means nothing.
+    # Only the component across the quaternion turns it; its length has no meaning.
     along = a * w + b * x + c * y + d * z
     g_quat[0], g_quat[1] = (a - along * w) * inverse, (b - along * x) * inverse
     g_quat[2], g_quat[3] = (c - along * y) * inverse, (d - along * z) * inverse

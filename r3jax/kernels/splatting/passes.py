@@ -96,7 +96,7 @@ def _tiles_of(record, width, height):
 
 @kernel
 def _project_block(block, cloud, view, size, records, counts):
-    """Projects the Gaussians of a block; counts what is drawn and their intersections."""
+    """Projects the Gaussians of a block; counts the visible ones and their intersections."""
     means, quats, log_scales, logits, sh, offsets = cloud
     width, height = size
     integers = records.view(np.int32)

@@ -180,7 +180,7 @@ def _are_finite(mean, quat, log_scales):
 def _is_outside(center, row, two_s, log_scales, size):
     """Checks whether even a ball of the Gaussian's largest scale would miss the image.
 
-    Most of what is out of sight needs no covariance, then.
+    Most invisible Gaussians then need no covariance.
     """
     scale = np.exp(max(log_scales[0], log_scales[1], log_scales[2]))
     squared = scale * scale * (row[0] * row[0] + row[1] * row[1] + row[2] * row[2]) + DILATION

@@ -12,7 +12,7 @@ CENTER_X, CENTER_Y, A, B, C, LOG_OPACITY = 0, 1, 2, 3, 4, 5
 RED, GREEN, BLUE, DEPTH = 6, 7, 8, 9
 
 START, COUNT = 10, 11
-"""int32: its intersections are START to START + COUNT; COUNT is 0 for what is not drawn."""
+"""int32: its intersections are START to START + COUNT; COUNT is 0 if it is not drawn."""
 
 SLOPE, VARIANCE, INVERSE_XX, TWO_S = 12, 13, 14, 15
 """xy/xx and determinant/xx of the covariance, 1/xx, and 2 s where alpha is 1/255."""

@@ -145,7 +145,7 @@ def begin_bricks(counts, starts, bricks):
 def number_slots(counts, slots):
     """Replaces the brick of every row by its slot, in the order of the map within a brick.
 
-    Slots by row, not rows by slot: what is gathered is then read in the order in which it lies.
+    Slots by row, not rows by slot: rows are then read in memory order.
     """
     shares, num = counts.shape[0], slots.shape[0]
     for share in prange(shares):
@@ -368,7 +368,7 @@ def mark_near(views, is_valid, layout, voxel_size, x, y, z, is_near):
 
 @inlined
 def compact(marks, count, chosen):
-    """Writes the numbers of what is marked by 1; returns how many they are."""
+    """Writes the indices of all elements that are 1; returns their count."""
     num = 0
     for i in range(count):
         chosen[num] = i

@@ -33,7 +33,7 @@ TARGETS = 4 * CHUNK
 """Places in the pyramid of a chunk's voxels, four each."""
 
 SPARE = 64
-"""Places behind the pyramid, for what is not covered: a write costs less than a branch."""
+"""Spare pixels behind the pyramid for writes outside it: a write costs less than a branch."""
 
 _SPARES = np.arange(CHUNK, dtype=np.float32) % SPARE
 """Which of them: not one for all, or each write would wait for the one before."""

@@ -1,6 +1,6 @@
 """Where voxels fall in a view, a chunk at a time: the arithmetic of `visibility.views`.
 
-What is worked out of a chunk lies in one flat array that stays in the L1 cache; the constants
+Results of a chunk are in one flat array that stays in the L1 cache; the constants
 below say where each part of it begins.
 """
 
@@ -66,7 +66,7 @@ def sound_views(views, voxel_size):
     is_valid = np.empty(views.focal.shape[0], np.bool_)
     is_size = voxel_size > _ZERO and voxel_size < _INFINITE
     for i in range(is_valid.shape[0]):
-        # Differences of infinities are NaN, and what is added to NaN stays NaN.
+        # Differences of infinities are NaN, and any sum with NaN is NaN.
         total = views.fx[i] + views.fy[i] + views.cx[i] + views.cy[i] + views.focal[i]
         total += views.max_range[i] + views.tolerance[i] + views.pixel_angle[i]
         for axis in range(3):

@@ -109,7 +109,7 @@ def _mean_of_four(texels: np.ndarray, half: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class ShadingTables:
-    """What the kernel needs to know of a world, as tables."""
+    """Tables of a world for the kernel."""
 
     faces: Float[np.ndarray, "F 16"]
     """Texel coordinates of corner 0 and of the edges to corners 1 and 2 (6 numbers); gradients

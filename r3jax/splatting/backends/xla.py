@@ -94,7 +94,7 @@ class Chunk(eqx.Module):
 
 
 class Layout(eqx.Module):
-    """What is known while compiling."""
+    """Static shapes."""
 
     width: int = eqx.field(static=True)
     """Columns of the image [px]."""

@@ -115,7 +115,7 @@ def refine(
         moments: Adam's, before.
         statistics: of the views since the last refinement.
         extent: of the cameras [m].
-        prunes_large: also prune what is larger than `config.prune_size` extents.
+        prunes_large: also prune Gaussians larger than `config.prune_size` extents.
         config: thresholds.
         key: of the positions of split children.
 

@@ -1,6 +1,6 @@
 """Fits a scene of Gaussians to views: the loop on the host round the jitted step.
 
-Before it starts, `check_memory` compares the memory that it needs with what is free. Its
+Before it starts, `check_memory` compares the memory that it needs with the free memory. Its
 coefficients are those of the compiled training step, rounded up;
 tests/splatting/training/test_memory.py holds the estimate against XLA's own account. `Growth` adds
 views, and Gaussians for what they show, while training runs.
@@ -580,7 +580,7 @@ def where_new(newborn: GaussianScene, scene: GaussianScene) -> GaussianScene:
 
     Args:
         newborn: round Gaussians, as `initialize` makes them.
-        scene: what is there already.
+        scene: the existing Gaussians.
     """
     there = np.asarray(scene.means)[np.asarray(scene.is_alive)]
     if len(there) == 0:

@@ -1,1 +1,1 @@
-"""Guidance while a capture is taken: what is done, and where to go next."""
+"""Guidance while a capture is taken: its progress, and where to go next."""

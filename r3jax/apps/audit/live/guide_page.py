@@ -165,7 +165,7 @@ def _from_above(pose: np.ndarray, camera: Camera) -> dict[str, float]:
     forward = pose[:3, 2]
     level = float(np.hypot(*forward[:2]))
     half = float(np.arctan(0.5 * camera.width / float(camera.fx)))
-    # A camera that looks down shows what is below its upper edge.
+    # A camera that looks down faces along its upper edge.
     ahead = forward if level > 0.05 else -pose[:3, 1]
     azimuth = float(np.arctan2(ahead[1], ahead[0]))
     return {"x": float(pose[0, 3]), "y": float(pose[1, 3]), "azimuth": azimuth, "half": half}
@@ -276,7 +276,7 @@ class ScanProgress:
     """Left, right, bottom and top of the plan [m]."""
 
     def words(self, pictures: int) -> str:
-        """Describes the progress, what is missing, and whether that is enough."""
+        """Describes the progress, the gaps, and whether that is enough."""
         parts = [
             f"{100 * share:.0f} % {SHORT[cause]}"
             for cause, share in sorted(self.causes.items(), key=lambda item: -item[1])

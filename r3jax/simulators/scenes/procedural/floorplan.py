@@ -128,7 +128,7 @@ class FloorPlan:
             width: clear width [m].
             sill: height of the lower edge [m].
             top: height of the upper edge [m].
-            view: seed of what is outside.
+            view: seed of the view outside.
         """
         r = self.rooms[room]
         face, out = {"n": (r.y1, 1), "s": (r.y0, -1), "e": (r.x1, 1), "w": (r.x0, -1)}[side]

@@ -315,7 +315,7 @@ def globe(seed: int) -> Model:
 
 
 def spotlight_rail(length: Real, ceiling: Real, count: int, reach: Real = 2.2) -> Model:
-    """Builds a rail along x under the ceiling with spotlights that shine on what is below."""
+    """Builds a rail along x under the ceiling with spotlights that shine downwards."""
     dark = f.enamel(f.CHARCOAL, 1)
     model = Model().add(
         box((-length / 2, -0.02, ceiling - 0.04), (length / 2, 0.02, ceiling)), dark
