@@ -197,24 +197,8 @@ def audit(
         RunError: a file of a run is missing or broken.
     """
     settings = AuditSettings() if settings is None else settings
-    if settings.depth_scale != 1.0 or settings.depth_along_ray:
-        source = source.with_depth(settings.depth_scale, is_along_ray=settings.depth_along_ray)
-    source = with_surfaces(source, settings.surfaces, settings.model, on_progress)
     step = lambda: on_progress("", 1)
-    on_progress("looking at the capture", 0)
-    survey = survey_of(source, settings)
-    on_progress("comparing pictures", len(survey.chosen))
-    faults = find_faults(source, survey.chosen, step, fits=survey.doubt is None)
-    if survey.strays:
-        stray = stray_finding(source, survey.strays, survey.chosen)
-        faults = dataclasses.replace(faults, findings=(stray, *faults.findings))
-    unknown = np.array([*faults.left_out, *faults.without_depth], dtype=np.int64)
-    survey = dataclasses.replace(survey, chosen=np.setdiff1d(survey.chosen, unknown))
-    if len(survey.chosen) < 2:
-        raise InputError(
-            f"{source.name}: {len(survey.chosen)} of its {len(source)} pictures shows a surface "
-            "of known depth: an audit judges each picture by the others, so it needs at least two"
-        )
+    source, survey, faults = _survey(source, settings, step, on_progress)
     on_progress("mapping", 2 * len(survey.chosen))
     seen = see(source, survey, settings.folds, step)
     unit = _UNSEEN_WEIGHT * (survey.cell_size / survey.voxel_size) ** 2
@@ -270,6 +254,33 @@ def audit(
         plan=plan,
         faults=faults,
     )
+
+
+def _survey(
+    source: Source,
+    settings: AuditSettings,
+    step: Callable[[], None],
+    on_progress: Progress,
+) -> tuple[Source, Survey, Faults]:
+    """Finds surfaces and faults of the pictures, and leaves out those that cannot be mapped."""
+    if settings.depth_scale != 1.0 or settings.depth_along_ray:
+        source = source.with_depth(settings.depth_scale, is_along_ray=settings.depth_along_ray)
+    source = with_surfaces(source, settings.surfaces, settings.model, on_progress)
+    on_progress("looking at the capture", 0)
+    survey = survey_of(source, settings)
+    on_progress("comparing pictures", len(survey.chosen))
+    faults = find_faults(source, survey.chosen, step, fits=survey.doubt is None)
+    if survey.strays:
+        stray = stray_finding(source, survey.strays, survey.chosen)
+        faults = dataclasses.replace(faults, findings=(stray, *faults.findings))
+    unknown = np.array([*faults.left_out, *faults.without_depth], dtype=np.int64)
+    survey = dataclasses.replace(survey, chosen=np.setdiff1d(survey.chosen, unknown))
+    if len(survey.chosen) < 2:
+        raise InputError(
+            f"{source.name}: {len(survey.chosen)} of its {len(source)} pictures shows a surface "
+            "of known depth: an audit judges each picture by the others, so it needs at least two"
+        )
+    return source, survey, faults
 
 
 def _evaluated_frames(
