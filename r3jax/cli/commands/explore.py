@@ -108,7 +108,7 @@ def _open_page(options: PageOptions, stack: contextlib.ExitStack) -> Callable[[E
     """Opens a server for a page that will show an expedition; the stack closes it.
 
     Returns:
-        Makes the `viewer.pages.LiveFeed` of the expedition, once there is one.
+        Makes the `viewer.run_page.LiveFeed` of the expedition, once there is one.
 
     Raises:
         InputError: viser is not installed.
