@@ -281,7 +281,7 @@ class Sheet:
             run: the run.
             step: the view.
             image: its image, [H, W, 3] uint8.
-            quantity: what the colors show, one of `blocks.QUANTITIES`.
+            quantity: what the colors show, one of `drawing.QUANTITIES`.
         """
         row = run.rows[step]
         facts = (
