@@ -56,7 +56,7 @@ class SurveySettings:
     """Of 360 photos, this many degrees around the direction below the camera are masked: the hand,
     person or tripod that holds it. 0 masks nothing."""
 
-    overlap_360: float = 0.0
+    overlap_360: float = 10.0
     """Angle that neighboring views of a 360 photo share [deg]; it is cut into six pinhole views of
     90 degrees and this angle."""
 

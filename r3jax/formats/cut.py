@@ -13,7 +13,7 @@ class Cut:
         InputError: an angle that makes no sense; names the option.
     """
 
-    overlap: float = 0.0
+    overlap: float = 10.0
     """Angle that neighboring views share [deg]."""
 
     hide_below: float = 25.0
