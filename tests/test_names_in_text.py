@@ -21,6 +21,7 @@ FILES = (".py", ".pyi", ".json", ".jsonl", ".html", ".txt", ".csv", ".ply", ".np
 PYTHON_FILE = re.compile(r"`((?:[\w.-]+/)*\w+\.pyi?)`")
 
 OTHERS = {
+    "panorama_sfm.py": "of COLMAP",
     "my_policy.py": "a file of the reader's own",
     "Path.is_file": "of pathlib",
     "view.rows": "a variable",

@@ -14,7 +14,7 @@ METHODS |= {"symlink_to", "hardlink_to", "chmod"}
 
 OF_OS = {"remove", "unlink", "rename", "renames", "replace", "mkdir", "makedirs", "rmdir"}
 OF_OS |= {"removedirs", "symlink", "link", "truncate", "mkfifo", "mknod", "open", "chmod"}
-HARMLESS = {"shutil": {"which"}, "tempfile": {"gettempdir"}}
+HARMLESS = {"shutil": {"which"}, "tempfile": {"gettempdir", "TemporaryFile"}}
 
 EXCEPTIONS = {
     # PyAV seeks in what it writes: a file in a folder that `whole_folder` has just made.

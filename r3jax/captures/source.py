@@ -448,7 +448,7 @@ def _check_points(images: PosedImages, xyz: np.ndarray, seen: np.ndarray | None)
     Args:
         images: the capture.
         xyz: its points, [m, 3].
-        seen: None if nothing says which image sees which point; else that of `images.points` is
+        seen: None if nothing says which image sees which point; else that of its points is
             checked.
     """
     rng = np.random.default_rng(0)
