@@ -266,3 +266,15 @@ def test_a_recorded_motion_has_its_body_again():
     motion = make_motion("ground", body=body)
     assert motion_of_record(plain_settings(motion)) == motion
     assert motion_of_record({"body": 1.0}).body == 1.0  # of earlier versions
+
+
+def test_a_level_camera_finds_the_floor_that_it_sees_from_afar():
+    """Walls have as many voxels at every height, and the box ends below the floor."""
+    y = np.arange(0.025, SIZE, VOXEL)
+    walls = [pole(x, v, 0.0, 2.0) for x in (0.025, SIZE - 0.025) for v in y]
+    far = floor_voxels()
+    far = far[far[:, 0] > 2.8]
+    grid = grid_of(all_free())
+    voxels = np.concatenate([far, *walls]) + [0.0, 0.0, 0.35]
+    room = room_for(Body(0.2), grid, voxels, VOXEL, pose_at(0.5, 2.0, 1.65))
+    assert np.median(room.floor) == pytest.approx(np.median(far[:, 2]) + 0.35, abs=VOXEL)

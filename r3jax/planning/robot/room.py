@@ -40,8 +40,8 @@ _FLOOR_WITHIN = 3.0
 _FLOOR_SHARE = 0.25
 """The floor is the lowest level with this share of the voxels of the fullest one."""
 
-_NOTHING_BELOW = 5.0
-"""Up to this distance from the robot hardly anything lies below the floor [m]."""
+_FLOOR_AROUND = 5.0
+"""Up to this distance otherwise [m]; within it hardly anything lies below the floor."""
 
 _MAX_BELOW = 0.5
 """A level with this number of voxels below it, as a share of its own, is the top of a table or a
@@ -549,28 +549,60 @@ def _floor_at(
     if body.floor is not None:
         return body.floor
     gap = np.linalg.norm(voxels[:, :2] - position[:2], axis=1)
-    around = voxels[gap < _NOTHING_BELOW, 2]
-    z = voxels[(gap < _FLOOR_WITHIN) & (voxels[:, 2] < position[2] + voxel_size), 2]
-    if len(z) >= 20:
-        level = np.rint((z - z.min()) / voxel_size).astype(np.int64)
-        num = int((position[2] - z.min()) / voxel_size) + 2
-        count = np.bincount(level, minlength=num)
-        # A camera that never shows the floor shows walls, in which all levels are alike.
-        is_flat = (count >= _FLOOR_SHARE * count.max()) & (count >= 3.0 * np.median(count))
-        lowest = int(np.argmax(is_flat))
-        below = np.count_nonzero(around < z.min() + (lowest - 1.5) * voxel_size)
-        if is_flat.any() and below < _MAX_BELOW * count[lowest]:
-            # A floor on the border of two levels fills both of them.
-            is_floor = (level == lowest) | (
-                (level == lowest + 1) & (count[level] >= 0.5 * count[lowest])
-            )
-            return float(z[is_floor].mean())
+    around = voxels[gap < _FLOOR_AROUND, 2]
+    beneath = voxels[:, 2] < position[2] + voxel_size
+    floor = _lowest_level(
+        voxels[(gap < _FLOOR_WITHIN) & beneath, 2], around, voxel_size, float(position[2])
+    )
+    # A level camera shows furniture nearby, and the floor farther off only.
+    if floor is None:
+        floor = _bottom_level(around[around < position[2] + voxel_size], voxel_size)
+    if floor is not None:
+        return floor
     x, y = np.clip(_column(position, origin, size), 0, np.array(occupied.shape[:2]) - 1)
     below = np.flatnonzero(
         occupied[x, y] & (origin[2] + size * (np.arange(occupied.shape[2]) + 1) < position[2])
     )
     # The grid has one layer more than its box.
     return float(origin[2] + size * (1 + (below[0] if len(below) else 0)))
+
+
+def _lowest_level(z: np.ndarray, around: np.ndarray, voxel_size: float, top: float) -> float | None:
+    """Finds the lowest level at which voxels lie side by side [m]; None: there is none.
+
+    Args:
+        z: heights of voxels near the robot, below it [m].
+        around: heights of those around it [m]: below the floor there are hardly any.
+        voxel_size: edge of a voxel [m].
+        top: height of the camera [m].
+    """
+    if len(z) < 20:
+        return None
+    level = np.rint((z - z.min()) / voxel_size).astype(np.int64)
+    count = np.bincount(level, minlength=int((top - z.min()) / voxel_size) + 2)
+    # A camera that never shows the floor shows walls, in which all levels are alike.
+    is_flat = (count >= _FLOOR_SHARE * count.max()) & (count >= 3.0 * np.median(count))
+    lowest = int(np.argmax(is_flat))
+    below = np.count_nonzero(around < z.min() + (lowest - 1.5) * voxel_size)
+    if not is_flat.any() or below >= _MAX_BELOW * count[lowest]:
+        return None
+    # A floor on the border of two levels fills both of them.
+    is_floor = (level == lowest) | ((level == lowest + 1) & (count[level] >= 0.5 * count[lowest]))
+    return float(z[is_floor].mean())
+
+
+def _bottom_level(z: np.ndarray, voxel_size: float) -> float | None:
+    """Finds the lowest level if it holds far more voxels than those above it; None: it does not.
+
+    Walls that end at the border of the image have fewer voxels the lower they are.
+    """
+    if len(z) < 20:
+        return None
+    count = np.bincount(np.rint((z - z.min()) / voxel_size).astype(np.int64), minlength=4)
+    lowest = z < z.min() + 1.5 * voxel_size  # noise, or a border of two levels, fills both
+    if lowest.sum() < max(3.0 * count[2:4].sum(), _FLOOR_SHARE * count.max(), 20):
+        return None
+    return float(z[lowest].mean())
 
 
 def _floor_map(
