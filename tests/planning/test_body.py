@@ -275,6 +275,6 @@ def test_a_level_camera_finds_the_floor_that_it_sees_from_afar():
     far = floor_voxels()
     far = far[far[:, 0] > 2.8]
     grid = grid_of(all_free())
-    voxels = np.concatenate([far, *walls]) + [0.0, 0.0, 0.35]
+    voxels = np.concatenate([far, *walls]) + np.array([0.0, 0.0, 0.35])
     room = room_for(Body(0.2), grid, voxels, VOXEL, pose_at(0.5, 2.0, 1.65))
     assert np.median(room.floor) == pytest.approx(np.median(far[:, 2]) + 0.35, abs=VOXEL)

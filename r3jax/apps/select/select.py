@@ -392,7 +392,7 @@ def select_frames(
         num: number of frames to choose.
         share: number of frames as a share of all frames.
         gain: choose enough frames to reach this share of the renderability with all frames. The
-            default is 0.95 if none of the three is given.
+            default is 0.99 if none of the three is given.
         targets: `T_world_camera` of the target views, [T, 4, 4]; None: the frames' own.
         camera: camera of the targets; None: that of the first frame.
         keep: indices of frames that are chosen first.

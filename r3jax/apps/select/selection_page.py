@@ -9,7 +9,7 @@ from matplotlib.patheffects import withStroke
 
 from r3jax.apps.select.outputs import Written
 from r3jax.apps.select.select import Selected
-from r3jax.apps.select.settings import FRAMES, STAND
+from r3jax.apps.select.settings import DEFAULT_GAIN, FRAMES, STAND
 from r3jax.files import write_atomic
 from r3jax.plots import style
 from r3jax.plots.page import render
@@ -21,7 +21,7 @@ _SHOWN = 12
 _SIDE = 230
 """Longer side of a thumbnail [px]."""
 
-_KNEE = 0.95
+_KNEE = DEFAULT_GAIN
 """Share of the renderability with all frames that defines the knee of the curve."""
 
 _HEADROOM = 0.35
@@ -121,7 +121,7 @@ def _cards(found: Selected) -> dict[str, str]:
 
 
 def knee(found: Selected) -> int | None:
-    """Returns the number of frames that reach 95 % of the mean R with all; None if not reached."""
+    """Returns the number of frames that reach 99 % of the mean R with all; None if not reached."""
     reached = np.flatnonzero(found.choice.share >= _KNEE)
     return int(reached[0]) + 1 if len(reached) else None
 
@@ -129,8 +129,8 @@ def knee(found: Selected) -> int | None:
 def _curve_note(found: Selected) -> str:
     number = knee(found)
     if number is None:
-        return "The frames kept reach less than 95 % of the mean R with all frames."
-    return f"{number} frames reach 95 % of the mean R with all frames."
+        return "The frames kept reach less than 99 % of the mean R with all frames."
+    return f"{number} frames reach 99 % of the mean R with all frames."
 
 
 def _curve(found: Selected) -> Figure:
@@ -151,7 +151,7 @@ def _curve(found: Selected) -> Figure:
     if (at := knee(found)) is not None:
         value = float(choice.renderability[at - 1])
         axes.plot([at], [value], "o", color=style.SECOND, markersize=8)
-        axes.annotate(f"{at} frames: 95 %", (at, value), (8, -14), color=style.SECOND,
+        axes.annotate(f"{at} frames: 99 %", (at, value), (8, -14), color=style.SECOND,
                       textcoords="offset points", fontsize=9, fontweight="bold")  # fmt: skip
     axes.set_xlim(0, None)
     axes.set_ylim(0, 1.12 * max(of_all, float(choice.renderability.max())))
