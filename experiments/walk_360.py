@@ -23,15 +23,14 @@ import tyro
 from PIL import Image
 
 from experiments.hand_walks import places
-from experiments.without_depth import compare
+from experiments.without_depth import compare, triangulate
 from r3jax.apps.audit.audit import audit
 from r3jax.apps.audit.settings import AuditSettings
 from r3jax.captures.settings import Surfaces
 from r3jax.captures.source import source_of
 from r3jax.captures.survey import RANGE
+from r3jax.errors import InputError
 from r3jax.formats.captures import open_capture
-from r3jax.formats.colmap.binary import write_binary
-from r3jax.formats.colmap.model import ColmapImage, ColmapModel, colmap_pose, points_without_tracks
 from r3jax.formats.colmap.reader import read_colmap
 from r3jax.formats.cut import Cut
 from r3jax.formats.cut_views import FACES
@@ -147,54 +146,25 @@ def _person(width: int) -> np.ndarray:
     return _rays(width)[..., 1] > np.cos(np.radians(_PERSON))
 
 
-def triangulate(folder: Path, width: int) -> None:
+def triangulate_panoramas(folder: Path, width: int) -> None:
     """Matches the panoramas and triangulates at their poses: a COLMAP model in `sparse/0`."""
-    import pycolmap
-
     poses = np.load(folder / "poses.npy")
     names = [f"{index:03d}.png" for index in range(len(poses))]
     lens = Lens("EQUIRECTANGULAR", width, width // 2, (float(width), float(width // 2)))
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = lens.model
-    reader.camera_params = ",".join(map(str, lens.params))
-    extraction = pycolmap.FeatureExtractionOptions()
-    extraction.sift.max_num_features = _FEATURES
-    database = folder / "database.db"
-    pycolmap.extract_features(
-        database,
-        folder / "images",
-        camera_mode=pycolmap.CameraMode.SINGLE,
-        reader_options=reader,
-        extraction_options=extraction,
-    )
-    pycolmap.match_exhaustive(database)
-    with pycolmap.Database.open(database) as opened:
-        ids = {image.name: image.image_id for image in opened.read_all_images()}
-        (camera,) = opened.read_all_cameras()
-    none = np.zeros((0, 2)), np.zeros(0, np.int64)
-    images = tuple(
-        ColmapImage(ids[name], name, camera.camera_id, *colmap_pose(poses[index]), *none)
-        for index, name in enumerate(names)
-    )
-    points = points_without_tracks(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     for name in ("known", "sparse/0"):
         (folder / name).mkdir(parents=True)
-    write_binary(folder / "known", ColmapModel({camera.camera_id: lens}, images, points))
-    known = pycolmap.Reconstruction(folder / "known")
-    found = pycolmap.triangulate_points(
-        known, database, folder / "images", folder / "sparse" / "0", clear_points=True
-    )
-    found.write(folder / "sparse" / "0")
+    triangulate(folder, names, lens, poses, _FEATURES)
     shutil.rmtree(folder / "known")
 
 
 def main(options: Options) -> None:
     """Renders what is missing, audits, and writes results.json."""
     if not (options.out / "poses.npy").exists():
-        shutil.rmtree(options.out, ignore_errors=True)
+        if options.out.exists() and any(options.out.iterdir()):
+            raise InputError(f"{options.out} holds no walk: give another --out, or remove it")
         render(options)
     if not (options.out / "sparse" / "0" / "points3D.bin").exists():
-        triangulate(options.out, options.width)
+        triangulate_panoramas(options.out, options.width)
     faces = source_of(open_capture(options.out / "faces", "z").source, "faces")
     up = "0,0,1"
     truth = audit(faces, AuditSettings(views=0, up=up))

@@ -21,7 +21,7 @@ Each comparison is a file in `--out`; what is there is not done again.
 import json
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -45,7 +45,7 @@ from r3jax.formats.captures import open_capture
 from r3jax.formats.colmap.binary import write_binary
 from r3jax.formats.colmap.model import ColmapImage, ColmapModel, colmap_pose, points_without_tracks
 from r3jax.formats.colmap.reader import read_colmap
-from r3jax.formats.lenses import pinhole_lens
+from r3jax.formats.lenses import Lens, pinhole_lens
 from r3jax.scoring.simulated import simulate_view
 from r3jax.splatting.ply import write_scene
 from r3jax.splatting.training.config import TrainConfig
@@ -94,8 +94,6 @@ def photos_alone(source: Source, folder: Path) -> Path:
     Returns:
         The folder, as COLMAP would leave it.
     """
-    import pycolmap
-
     if (folder / "sparse" / "0" / "points3D.bin").exists():
         return folder
     shutil.rmtree(folder, ignore_errors=True)
@@ -104,13 +102,30 @@ def photos_alone(source: Source, folder: Path) -> Path:
     names = [f"{index:05d}.png" for index in range(len(source))]
     for index, name in enumerate(names):
         Image.fromarray(source.read(index)[0]).save(folder / "images" / name)
+    triangulate(folder, names, pinhole_lens(source.camera(0)), source.poses, _FEATURES)
+    return folder
+
+
+def triangulate(
+    folder: Path, names: Sequence[str], lens: Lens, poses: np.ndarray, features: int
+) -> None:
+    """Matches photos and triangulates points at their poses: a COLMAP model in `sparse/0`.
+
+    Args:
+        folder: with the photos in `images`, and empty folders `known` and `sparse/0`.
+        names: of the photos.
+        lens: of all photos.
+        poses: `T_world_camera`, [n, 4, 4].
+        features: most SIFT features of a photo.
+    """
+    import pycolmap
+
     database = folder / "database.db"
-    lens = pinhole_lens(source.camera(0))
     reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = "PINHOLE"
+    reader.camera_model = lens.model
     reader.camera_params = ",".join(map(str, lens.params))
     extraction = pycolmap.FeatureExtractionOptions()
-    extraction.sift.max_num_features = _FEATURES
+    extraction.sift.max_num_features = features
     pycolmap.extract_features(
         database,
         folder / "images",
@@ -124,7 +139,7 @@ def photos_alone(source: Source, folder: Path) -> Path:
         (camera,) = opened.read_all_cameras()
     none = np.zeros((0, 2)), np.zeros(0, np.int64)
     images = tuple(
-        ColmapImage(ids[name], name, camera.camera_id, *colmap_pose(source.poses[index]), *none)
+        ColmapImage(ids[name], name, camera.camera_id, *colmap_pose(poses[index]), *none)
         for index, name in enumerate(names)
     )
     points = points_without_tracks(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
@@ -134,7 +149,6 @@ def photos_alone(source: Source, folder: Path) -> Path:
         known, database, folder / "images", folder / "sparse" / "0", clear_points=True
     )
     found.write(folder / "sparse" / "0")
-    return folder
 
 
 def splat_alone(photos: Source, path: Path) -> Path:

@@ -22,7 +22,7 @@ from r3jax.mapping.occupancy import OccupancyGrid, a_grid, cells_of
 from r3jax.mapping.seen import seen_in_view
 from r3jax.mapping.state import MapState, a_map
 from r3jax.scoring.config import Score, ScoringConfig, scoring_settings
-from r3jax.scoring.terms import score_voxels
+from r3jax.scoring.terms import deficits_of, score_voxels
 from r3jax.visibility.views import pinhole_view
 
 CAUSES = ("never seen", "too oblique", "inconsistent", "too far")
@@ -104,9 +104,7 @@ def _divide_visible(
         some = voxels.take(index, valid)
         terms = score_voxels(some, position, focal, score)
         factors = jnp.stack([terms.bias, terms.noise, terms.resolution])
-        deficit = 1.0 - terms.value
-        if score.importance is not None:
-            deficit *= score.importance(some)
+        deficit = deficits_of(some, terms, score)
         part = jnp.where(valid[None, :], attribute_deficit(deficit, factors), 0.0)
         target = jnp.where(valid, index, num)  # out of range, so dropped
         return shares.at[:, target].set(part, mode="drop"), totals + jnp.sum(part, axis=1)

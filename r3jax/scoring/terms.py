@@ -116,7 +116,13 @@ def deficits(
     kappa_is_one: Bool[Array, " n"] | None = None,
 ) -> Float[Array, " n"]:
     """Computes 1 - R of every voxel, times its importance; arguments as in `score_voxels`."""
-    deficit = 1.0 - score_voxels(voxels, camera_position, focal, score, kappa_is_one).value
+    terms = score_voxels(voxels, camera_position, focal, score, kappa_is_one)
+    return deficits_of(voxels, terms, score)
+
+
+def deficits_of(voxels: MapState, terms: Renderability, score: Score) -> Float[Array, " n"]:
+    """Computes `deficits` from known terms."""
+    deficit = 1.0 - terms.value
     return deficit if score.importance is None else score.importance(voxels) * deficit
 
 
