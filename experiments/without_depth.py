@@ -13,13 +13,14 @@ compared by a rank correlation (Spearman), over the regions that both know; and 
 audits judging from the places that the one without depth chose. An interval is that of 1,000
 resamplings of regions, or of frames. The views that an audit suggests are simulated on the map with
 depth: how much they raise the mean R of its surfaces, as a share of what the views do that were
-chosen with depth.
+chosen with depth. Every photo is held out once: R of an audit, which leaves it out, against the
+PSNR of a splat that was trained on the others.
 
 Each comparison is a file in `--out`; what is there is not done again.
 """
 
 import json
-import shutil
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -34,6 +35,7 @@ from PIL import Image
 from scipy.spatial import KDTree
 from scipy.stats import spearmanr
 
+from experiments.select import exposed_psnr
 from r3jax.apps.audit.audit import Audit, audit
 from r3jax.apps.audit.diagnosis import Diagnosis, demand_of, known_rows
 from r3jax.apps.audit.settings import AuditSettings
@@ -41,6 +43,7 @@ from r3jax.apps.audit.suggest import Task
 from r3jax.captures.alignment import Alignment
 from r3jax.captures.settings import Surfaces
 from r3jax.captures.source import Source, source_of
+from r3jax.evaluation.evaluate import evaluate
 from r3jax.formats.captures import open_capture
 from r3jax.formats.colmap.binary import write_binary
 from r3jax.formats.colmap.model import ColmapImage, ColmapModel, colmap_pose, points_without_tracks
@@ -69,6 +72,13 @@ _SPLAT = TrainConfig(iterations=4000, capacity=60_000)
 _SPLAT_SIDE = 270
 """Longer side of the images that they are trained on [px]."""
 
+_FOLDS = 8
+
+_FOLD = TrainConfig(iterations=1500, num_gaussians=10_000)
+"""Training of the splats that show held-out photos."""
+
+_FOLD_SIDE = 128
+
 
 @dataclass(frozen=True)
 class Options:
@@ -96,13 +106,16 @@ def photos_alone(source: Source, folder: Path) -> Path:
     """
     if (folder / "sparse" / "0" / "points3D.bin").exists():
         return folder
-    shutil.rmtree(folder, ignore_errors=True)
-    for name in ("images", "known", "sparse/0"):
-        (folder / name).mkdir(parents=True)
-    names = [f"{index:05d}.png" for index in range(len(source))]
-    for index, name in enumerate(names):
-        Image.fromarray(source.read(index)[0]).save(folder / "images" / name)
-    triangulate(folder, names, pinhole_lens(source.camera(0)), source.poses, _FEATURES)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder.parent) as scratch:
+        made = Path(scratch) / folder.name
+        for name in ("images", "known", "sparse/0"):
+            (made / name).mkdir(parents=True)
+        names = [f"{index:05d}.png" for index in range(len(source))]
+        for index, name in enumerate(names):
+            Image.fromarray(source.read(index)[0]).save(made / "images" / name)
+        triangulate(made, names, pinhole_lens(source.camera(0)), source.poses, _FEATURES)
+        made.rename(folder)  # fails where another program has left something there
     return folder
 
 
@@ -159,6 +172,23 @@ def splat_alone(photos: Source, path: Path) -> Path:
         found = fit(load_views(frames, _SPLAT_SIDE), _SPLAT)
         write_scene(path, found.scene)
     return path
+
+
+def held_out_psnr(photos: Source, path: Path) -> np.ndarray:
+    """PSNR of each photo, after a gain for each channel, by a splat of the others [dB], [n]."""
+    if not path.exists():
+        as_it_is = Alignment(np.eye(3), 1.0, np.zeros(3))
+        frames = (photos.frame(index, as_it_is) for index in range(len(photos)))
+        views, numbers = load_views(frames, _FOLD_SIDE), np.arange(len(photos))
+        psnr = np.zeros(len(photos))
+        for fold in range(_FOLDS):
+            out = numbers[numbers % _FOLDS == fold]
+            scene = fit(views.take(numbers[numbers % _FOLDS != fold]), _FOLD).scene
+            judged = views.take(out)
+            pairs = zip(evaluate(scene, judged).renders, np.asarray(judged.rgb), strict=True)
+            psnr[out] = [exposed_psnr(*pair) for pair in pairs]
+        np.save(path, psnr)
+    return np.load(path)
 
 
 def voxels(found: Audit, diagnosis: Diagnosis) -> tuple[np.ndarray, np.ndarray]:
@@ -224,8 +254,14 @@ def from_places_of(truth: Audit, found: Audit) -> Diagnosis:
     return Task(truth.camera, demand, truth.config).evaluate(truth.seen.state)[1]
 
 
-def compare(truth: Audit, found: Audit) -> dict[str, Any]:
-    """How an audit without depth compares with that from depth."""
+def ranked_by_psnr(found: Audit, psnr: np.ndarray) -> tuple[float, float, float]:
+    """Correlates the R of an audit's photos with their PSNR when they are held out."""
+    pairs = [(f.score.renderability, psnr[f.index]) for f in found.frames if f.score.judged]
+    return ranks(*np.array(pairs).T)
+
+
+def compare(truth: Audit, found: Audit, psnr: np.ndarray) -> dict[str, Any]:
+    """How an audit without depth compares with that from depth, and both with held-out photos."""
     there, here = regions(truth, truth.diagnosis), regions(found, found.diagnosis)
     both = sorted(there.keys() & here.keys())
     of_regions = ranks(np.array([there[k] for k in both]), np.array([here[k] for k in both]))
@@ -246,6 +282,8 @@ def compare(truth: Audit, found: Audit) -> dict[str, Any]:
         "spearman_regions_from_same_places": of_same,
         "frames_compared": len(pairs),
         "spearman_frames": of_frames,
+        "spearman_psnr": ranked_by_psnr(found, psnr),
+        "spearman_psnr_with_depth": ranked_by_psnr(truth, psnr),
         "not_known": found.shares[found.unknown],
         "unseen": found.shares["unseen"],
         "unseen_with_depth": truth.shares["unseen"],
@@ -280,11 +318,11 @@ def compare_capture(path: Path, out: Path, surfaces: tuple[Surfaces, ...]) -> li
             bare = source_of(read_colmap(photos), capture.name)
             model = splat_alone(bare, folder / "splat.ply") if name == "model" else None
             settings = AuditSettings(surfaces=name, model=model)
-            known = truth()
+            known, psnr = truth(), held_out_psnr(bare, folder / "psnr.npy")
             begun = time.perf_counter()
             found = audit(bare, settings)
             row = {"capture": path.name, "surfaces": name, "pictures": len(bare)}
-            row |= {"seconds": time.perf_counter() - begun, **compare(known, found)}
+            row |= {"seconds": time.perf_counter() - begun, **compare(known, found, psnr)}
             cell.write_text(json.dumps(row, indent=1) + "\n")
         rows.append(json.loads(cell.read_text()))
         print(json.dumps(rows[-1], indent=1), flush=True)
