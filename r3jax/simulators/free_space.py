@@ -1,5 +1,7 @@
 """The evaluation protocol's access to a world: its free space, and images from any pose.
 
+The free space of a scene in Habitat-Sim is that of its mesh file; its images are Habitat's.
+
 The free space is sampled by nodes a tenth of a meter apart. A node is free if every surface is at
 least the margin away; the nodes that a camera can reach are those connected to its start. Two
 neighbors that are free have no surface between them, as their distance is below the margin: the
@@ -24,6 +26,7 @@ from r3jax.geometry.cameras import Camera
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.simulators.base import NoisySimulator, Simulator
 from r3jax.simulators.clearance import SurfaceDistance, cut_triangles, point_triangle
+from r3jax.simulators.habitat import HabitatSimulator
 from r3jax.simulators.raycast.raycast import RaycastSimulator
 from r3jax.simulators.raycast.rays import TriangleScene
 
@@ -58,9 +61,10 @@ class GroundTruth:
             ValueError: the simulator has no mesh.
         """
         inner = simulator.simulator if isinstance(simulator, NoisySimulator) else simulator
-        if not isinstance(inner, RaycastSimulator):
+        if not isinstance(inner, (RaycastSimulator, HabitatSimulator)):
             raise InputError(f"a {type(inner).__name__} has no mesh to take ground truth from")
-        self._simulator = inner
+        self._shown = inner
+        self._simulator = inner.mesh if isinstance(inner, HabitatSimulator) else inner
 
     @property
     def scene(self) -> str:
@@ -70,12 +74,12 @@ class GroundTruth:
 
     @property
     def scene_hash(self) -> str:
-        """SHA-256 of geometry, colors and lamps."""
+        """SHA-256 of geometry, colors and lamps, and of who renders them if it is not we."""
         return self._scene_hash
 
     @functools.cached_property
     def _scene_hash(self) -> str:
-        return self._simulator.content_hash
+        return self._shown.content_hash
 
     def free_positions(self, spacing: Sequence[float | int], margin: float | int) -> np.ndarray:
         """Finds the lattice points that a camera can reach from the start.
@@ -127,7 +131,7 @@ class GroundTruth:
 
     def frames(self, poses: np.ndarray, camera: Camera) -> Iterator[Frame]:
         """Yields frames without noise or limit of range at `poses` [V, 4, 4], one by one."""
-        simulator = self._simulator.with_camera(camera, max_range=None)
+        simulator = self._shown.with_camera(camera, max_range=None)
         return (simulator.render(pose) for pose in poses)
 
     def room_along(

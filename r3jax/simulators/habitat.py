@@ -26,6 +26,7 @@ whatever its stage config says: of all 24 rotations the identity alone agreed.
 """
 
 import contextlib
+import copy
 import ctypes
 import hashlib
 import math
@@ -135,6 +136,28 @@ class HabitatSimulator:
     def close(self) -> None:
         """Frees Habitat's memory and graphics context; the next render loads the scene again."""
         self._habitat.close()
+
+    def with_camera(self, camera: Camera, *, max_range: float | int | None) -> "HabitatSimulator":
+        """Returns a simulator of the same scene with another camera; it takes this one's place.
+
+        Args:
+            camera: square pixels and centered.
+            max_range: as at the start [m].
+
+        Raises:
+            ValueError: a camera that Habitat does not have, or a range that is not positive.
+        """
+        other = copy.copy(self)
+        other._camera = camera
+        other._mesh = self._mesh.with_camera(camera, max_range=max_range)
+        other._max_depth = np.float32(np.inf if max_range is None else max_range)
+        other._habitat = self._habitat.resized(camera)
+        return other
+
+    @property
+    def mesh(self) -> RaycastSimulator:
+        """The ray caster of the mesh file: its surfaces, of which Habitat has no distances."""
+        return self._mesh
 
     @property
     def camera(self) -> Camera:
@@ -252,6 +275,12 @@ class _Habitat:
         """Notes a scene's file, the images' (height, width) and horizontal field of view [deg]."""
         self._library, self._settings = library, (file, size, fov, gpu)
         self._simulator: Any = None
+
+    def resized(self, camera: Camera) -> "_Habitat":
+        """Opens the same scene for another camera."""
+        file, _, _, gpu = self._settings
+        size, fov = (camera.height, camera.width), horizontal_fov_deg(camera)
+        return _shared_habitat(self._library, file, size, fov, gpu)
 
     def close(self) -> None:
         """Ends the simulator, if it is open."""

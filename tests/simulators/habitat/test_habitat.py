@@ -19,6 +19,7 @@ from r3jax.errors import InputError
 from r3jax.geometry.cameras import Camera
 from r3jax.simulators import habitat
 from r3jax.simulators.base import NoisySimulator, Simulator
+from r3jax.simulators.free_space import GroundTruth
 from r3jax.simulators.habitat import BARE_GLB
 from r3jax.simulators.meshes import load_world, world_from_file
 from r3jax.simulators.raycast.embree import library
@@ -175,6 +176,33 @@ def test_it_starts_where_the_ray_caster_does(tmp_path, monkeypatch):
     pose[:3, 3] += 0.1
     given = habitat.HabitatSimulator(room.mesh, CAMERA, start_pose=pose)
     np.testing.assert_array_equal(given.start_pose, pose)
+
+
+def test_test_views_are_habitats_and_free_space_is_the_meshs(tmp_path, monkeypatch):
+    """Of the camera of the test views, without noise or limit of range."""
+    room = box_room(tmp_path / "a.glb", is_inward=True)
+    fake = FakeHabitat(lambda *state: ray_cast(room, requested(fake), np.eye(3))(*state))
+    installed(fake, monkeypatch)
+    theirs = habitat.HabitatSimulator(room.mesh, CAMERA, max_range=1.0, seed=3)
+    judged = GroundTruth(NoisySimulator(theirs, 0.01, 0))
+    ours = RaycastSimulator(load_world(room.mesh), CAMERA, seed=3)
+    expected = GroundTruth(ours)
+    places = judged.free_positions((0.5, 0.5, 0.5), 0.3)
+    np.testing.assert_array_equal(places, expected.free_positions((0.5, 0.5, 0.5), 0.3))
+    assert judged.scene_hash == theirs.content_hash != expected.scene_hash
+    wide = Camera.from_fov(40, 30, 80.0)
+    for frame in judged.frames(ours.start_pose[None], wide):
+        caster = ours.with_camera(wide, max_range=None, cull_back_faces=True)
+        np.testing.assert_array_equal(frame.depth, caster.render(ours.start_pose).depth)
+        assert np.asarray(frame.depth).max() > 1.0
+    assert np.isinf(theirs.render(ours.start_pose).depth).any()
+
+
+def requested(fake: FakeHabitat) -> Camera:
+    """The camera of the newest simulator."""
+    _, (sensor, _) = fake.started[-1]
+    height, width = sensor.resolution
+    return Camera.from_fov(width, height, sensor.hfov.value)
 
 
 def test_another_world_is_noticed(tmp_path, monkeypatch):
