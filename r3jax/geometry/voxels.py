@@ -30,9 +30,13 @@ def check_near_origin(name: str, points: np.ndarray, limit: float = MAX_COORDINA
     """
     largest = float(np.abs(points).max(initial=0.0))
     if largest > limit:
+        rows = np.asarray(points, np.float64).reshape(-1, 3)
+        farthest = rows[np.argmax(np.abs(rows).max(axis=1))]
+        origin = np.where(np.abs(farthest) > limit, np.round(farthest, -3), 0.0)
         raise InputError(
             f"{name} has the coordinate {largest:,.0f} m, the limit is {limit:,.0f} m: subtract an "
-            "origin near the cameras from all coordinates, in float64"
+            f"origin near the cameras, such as {origin.tolist()}, from all coordinates, in "
+            "float64; leave out a frame whose pose alone is so far away"
         )
 
 

@@ -77,3 +77,8 @@ def test_what_float32_cannot_hold_to_a_millimeter_is_refused(value):
     points[2, 1] = value
     with pytest.raises(ValueError, match=r"bounds.*origin"):
         check_near_origin("bounds", points)
+
+
+def test_an_origin_is_suggested_for_utm():
+    with pytest.raises(ValueError, match=r"such as \[500000\.0, -5600000\.0, 0\.0\]"):
+        check_near_origin("position", np.array([500_123.4, -5_599_876.5, 112.0]))
