@@ -21,6 +21,7 @@ import tyro
 
 import r3jax
 from r3jax.geometry.cameras import pixel_rays
+from r3jax.mapping.tile_files import Voxels
 from r3jax.mapping.tiles import Layer, Rows, Tile, packed_index, packed_layer, table_of, tile_rows
 from r3jax.planning.planner import Planner, at_hand
 
@@ -143,7 +144,7 @@ def by_tiles(side: float, robot: np.ndarray, camera: r3jax.Camera) -> Planner:
             values = np.asarray(known(empty, side, robot).log_odds)
             if values.any():
                 cells[i, j, 0] = {"log_odds": packed_layer(values)}
-    tiles = replace(far.tiles, middle=(9999, 0, 0), voxels=voxels, cells=cells)
+    tiles = replace(far.tiles, middle=(9999, 0, 0), voxels=Voxels(voxels), cells=cells)
     return at_hand(replace(planner, far=replace(far, tiles=tiles)), robot)
 
 

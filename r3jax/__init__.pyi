@@ -19,6 +19,7 @@ from .mapping.occupancy import OccupancyGrid, empty_grid, integrate_depth
 from .mapping.state import MapState, empty_map
 from .mapping.update import integrate, integrate_points
 from .planning.decide import GreedyPolicy
+from .planning.merge_planners import merge_planners
 from .planning.next_views import NextViews, next_views
 from .planning.planner import (
     Planner,
@@ -107,6 +108,7 @@ __all__ = [
     "lookup",
     "make_policy",
     "merge",
+    "merge_planners",
     "next_views",
     "observe",
     "observe_points",

@@ -20,7 +20,8 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 Kind = Literal[
-    "run", "team", "model", "training", "audit", "benchmark", "cell", "site", "planner", "selection"
+    "run", "team", "model", "training", "audit", "benchmark", "cell", "site", "planner",
+    "selection", "tile-folder",
 ]  # fmt: skip
 
 MARKER = ".r3jax"
@@ -49,6 +50,7 @@ _MARKS: dict[Kind, tuple[tuple[str, tuple[bytes, ...]], ...]] = {
     "planner": (("planner.json", (b'"r3jax-planner"',)),),
     "cell": (("cell.json", (b'"exploration"', b'"test_views"')),),
     "selection": (),
+    "tile-folder": (),
     "site": (
         ("index.html", (b'<meta name="generator" content="r3jax benchmark">',)),
         ("index.html", (b"</style></head><body>\n<h1>r3jax benchmark</h1>\n",)),
@@ -263,12 +265,17 @@ def _partial_name(path: Path) -> str:
     return f".{path.name}.{secrets.token_hex(4)}.partial"
 
 
-def write_atomic(path: Path, data: bytes) -> None:
+def write_atomic(path: Path, data: bytes, *, durable: bool = True) -> None:
     """Writes a file under a temporary name, flushes it to the disk, then renames it.
 
     A reader sees the old file or the new one, never a part. Of several writers at once, the last
     to rename wins; each has a temporary name of its own, on whatever machine it runs. A link or a
     hard link of that name is replaced; what it leads to stays as it is.
+
+    Args:
+        path: the file.
+        data: its content.
+        durable: False for a file that need not survive a power cut: nothing is flushed.
 
     Raises:
         NotOursError: a folder on the way is a link.
@@ -282,7 +289,8 @@ def write_atomic(path: Path, data: bytes) -> None:
             with open(descriptor, "wb") as file:
                 file.write(data)
                 file.flush()
-                os.fsync(file.fileno())
+                if durable:
+                    os.fsync(file.fileno())
             name = folder.at(path.name)
             os.replace(temporary, name, src_dir_fd=shop.handle, dst_dir_fd=folder.handle)
         except BaseException:

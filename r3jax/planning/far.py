@@ -493,3 +493,21 @@ def far_of(arrays: Mapping[str, np.ndarray], config: MappingConfig, camera: Came
         costs=(arrays["costs.corner"], float(arrays["costs.edge"])),
         refused=arrays["refused"],
     )  # fmt: skip
+
+
+def merged_far(fars: Sequence[Far], tiles: Tiles) -> Far:
+    """Joins what several planners know of far places, round the first one's block.
+
+    Args:
+        fars: of planners with the same lattice.
+        tiles: of all of them.
+    """
+    first = fars[0]
+    return replace(
+        first,
+        tiles=tiles,
+        views=functools.reduce(_joined, (far.views for far in fars)),
+        trails=np.unique(np.concatenate([far.trails for far in fars]), axis=0),
+        zones=tuple(zone for far in fars for zone in far.zones),
+        refused=np.unique(np.concatenate([far.refused for far in fars]), axis=0),
+    )

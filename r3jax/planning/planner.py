@@ -11,6 +11,7 @@ immutable: each call returns a new one.
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, cast
 
 import equinox as eqx
@@ -40,6 +41,7 @@ from r3jax.mapping.occupancy import (
     squared_distance,
 )
 from r3jax.mapping.state import MapState, empty_map
+from r3jax.mapping.tile_files import TILE_MEMORY, open_tile_folder
 from r3jax.mapping.tiles import ACROSS, check_view, whole_map
 from r3jax.mapping.update import integrate_growing
 from r3jax.planning.decide import GreedyPolicy, PlannerState
@@ -106,6 +108,8 @@ def start(
     starts: Iterable[ArrayLike] = (),
     config: MappingConfig | None = None,
     key: Array | None = None,
+    tile_folder: str | Path | None = None,
+    tile_memory: float | int = TILE_MEMORY,
 ) -> Planner:
     """Starts a planner with an empty map.
 
@@ -122,9 +126,14 @@ def start(
             in at first.
         config: sizes of voxels and cells, range of the sensor.
         key: random key for the policy's initial memory; None: `jax.random.key(0)`.
+        tile_folder: scratch folder on a local disk for tiles that memory has no room for; several
+            processes may use one. Their files are deleted once no planner uses them. None: all
+            tiles stay in memory.
+        tile_memory: memory of the tiles beyond which the farthest go to disk [bytes].
 
     Raises:
-        ValueError: an invalid box, too many cells, an unknown policy.
+        ValueError: an invalid box, too many cells, an unknown policy; a tile folder that holds
+            something else, cannot be written, or is given without tiles.
     """
     if is_cpu_only():
         compile_ahead()
@@ -135,10 +144,18 @@ def start(
     endless = [[-np.inf] * 3, [np.inf] * 3]
     box = np.asarray(endless if bounds is None else bounds, dtype=np.float64)
     if not config.tiles and np.all(np.isfinite(box)):
+        if tile_folder is not None:
+            raise InputError(
+                "tile_folder is for a planner with tiles: leave out the bounds, or give "
+                "config=MappingConfig(tiles=True)"
+            )
         grid = first_grid(box, starts, config)
         return Planner(first_map(config), grid, policy.init(camera, grid, key=key), policy, config)
     starts = [np.asarray(pose) for pose in starts]
     far = first_far(config, policy, camera, box, starts)
+    if tile_folder is not None:
+        folder = open_tile_folder(tile_folder, tile_memory)
+        far = replace(far, tiles=replace(far.tiles, folder=folder))
     config = replace(config, tiles=True, capacity=far.tiles.capacity)
     grid = mark_starts(far.grid(np.zeros(far.tiles.lattice.shape, np.float32)), starts, config)
     policy_state = policy.init(camera, grid, key=key)

@@ -15,6 +15,7 @@ from jaxtyping import Array
 from r3jax.errors import InputError
 from r3jax.frame import Frame
 from r3jax.geometry.arguments import checked
+from r3jax.mapping.tile_files import Voxels
 from r3jax.planning.far import NO_VIEWS
 from r3jax.planning.planner import Planner, a_planner, first_map, mark_starts, take_in
 
@@ -59,7 +60,7 @@ def rebuild(
     grid = eqx.tree_at(lambda g: g.log_odds, planner.grid, unknown)
     if far is not None:
         # Trails and views were found on poses that were wrong.
-        tiles = replace(far.tiles, voxels={}, cells={})
+        tiles = replace(far.tiles, voxels=Voxels(), cells={})
         far = replace(far, tiles=tiles, trails=far.trails[:0], views=NO_VIEWS)
     grid = mark_starts(grid, starts, planner.config)
     config = replace(planner.config, capacity=planner.map_state.capacity)

@@ -1,13 +1,15 @@
 """A planner on disk: its map and grid, its policy's memory, and all of its settings.
 
-    NAME/  planner.json  000000/
+    NAME/  planner.json  000000/  tiles/
 
 `planner.json` names the policy, its settings, the camera and the settings of the map; the folder
-beside it holds the arrays, as a run's checkpoint does, with the hash of each of its files.
+beside it holds the arrays, as a run's checkpoint does, with the hash of each of its files. The
+voxels of tiles lie in `tiles/`, a file for each, named by its hash: all of them, whether they were
+in memory or in a tile folder.
 """
 
 import json
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +19,20 @@ import numpy as np
 
 from r3jax import files
 from r3jax.checkpoints import discard, numbered, read_arrays, write_checkpoint
-from r3jax.errors import InputError
+from r3jax.errors import InputError, PathError
 from r3jax.geometry.arguments import checked
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.config import MappingConfig
 from r3jax.mapping.occupancy import OccupancyGrid, empty_grid
 from r3jax.mapping.state import empty_map
+from r3jax.mapping.tile_files import (
+    TILE_MEMORY,
+    Voxels,
+    open_tile_folder,
+    read_tiles,
+    remove_other_tiles,
+    write_tiles,
+)
 from r3jax.planning.far import far_arrays, far_of
 from r3jax.planning.planner import Planner, a_planner
 from r3jax.planning.registry import config_class, make_policy
@@ -34,7 +44,11 @@ from r3jax.validation.errors import ForeignFileError
 from r3jax.validation.files import read_bytes
 from r3jax.validation.json_text import parse_json, sealed, unsealed
 
-FORMAT, VERSION = "r3jax-planner", 1
+FORMAT, VERSION = "r3jax-planner", 2
+_READ = (1, 2)
+"""The first kept the voxels of tiles among its arrays."""
+
+_TILES = "tiles"
 
 _MAX_BYTES = 1 << 20
 
@@ -60,8 +74,11 @@ def save(planner: Planner, path: str | Path) -> None:
     files.own_folder(folder, "planner")
     tables = map_tables(planner.map_state, planner.grid)
     tables["policy"] = named_arrays(planner.policy_state)
+    listed = {"sha256": np.zeros((0, 32), np.uint8)}
     if planner.far is not None:
-        tables["far"] = far_arrays(planner.far)
+        listed = write_tiles(planner.far.tiles.voxels, folder / _TILES)
+        without = replace(planner.far, tiles=replace(planner.far.tiles, voxels=Voxels()))
+        tables |= {"far": far_arrays(without), _TILES: listed}
     plain = {
         "format": FORMAT,
         "version": VERSION,
@@ -77,14 +94,27 @@ def save(planner: Planner, path: str | Path) -> None:
     files.write_atomic(folder / "planner.json", (text + "\n").encode())
     for old in numbered(folder)[:-1]:
         discard(old)
+    remove_other_tiles(folder / _TILES, listed)
 
 
-def load(path: str | Path) -> Planner:
+def load(
+    path: str | Path,
+    *,
+    tile_folder: str | Path | None = None,
+    tile_memory: float | int = TILE_MEMORY,
+) -> Planner:
     """Loads a planner written by `save`.
+
+    Args:
+        path: its folder.
+        tile_folder: as in `start`; None: all tiles are read into memory. Not used by a planner
+            without tiles.
+        tile_memory: as in `start` [bytes].
 
     Raises:
         RunError: it is missing, damaged, or of a newer version; names the file.
-        ValueError: a policy that is not installed here.
+        ValueError: a policy that is not installed here; a tile folder as in `start`; a tile that is
+            missing or damaged.
     """
     folder = Path(path)
     file = folder / "planner.json"
@@ -96,10 +126,10 @@ def load(path: str | Path) -> Planner:
         raise RunError(file, f"the file cannot be read ({error})") from None
     if not isinstance(plain, dict) or plain.get("format") != FORMAT:
         raise RunError(file, f"the file is not a saved planner's (no format {FORMAT!r})")
-    if plain.get("version") != VERSION:
+    if plain.get("version") not in _READ:
         raise RunError(
             file,
-            f"version {plain.get('version')!r:.20}, but this r3jax reads version {VERSION}: "
+            f"version {plain.get('version')!r:.20}, but this r3jax reads up to {VERSION}: "
             "install the one that wrote it",
         )
     try:
@@ -113,7 +143,18 @@ def load(path: str | Path) -> Planner:
     try:
         stored = read_arrays(arrays_at)
         tables = {name: from_storable(table) for name, table in stored.items()}
-        return _planner_of(tables, policy, camera, config)
+        planner = _planner_of(tables, policy, camera, config)
+        far = planner.far
+        if far is None:
+            return planner
+        into = None if tile_folder is None else open_tile_folder(tile_folder, tile_memory)
+        tiles = replace(far.tiles, folder=into)
+        if _TILES in tables:
+            voxels = read_tiles(folder / _TILES, tables[_TILES], into, tiles.middle)
+            tiles = replace(tiles, voxels=voxels)
+        return replace(planner, far=replace(far, tiles=tiles))
+    except PathError:
+        raise
     except (OSError, ValueError, KeyError, TypeError, ForeignFileError) as error:
         raise RunError(arrays_at, f"the arrays cannot be read ({error})") from None
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import r3jax
-from r3jax.errors import InputError
+from r3jax.errors import InputError, PathError
 from r3jax.mapping.tiles import whole_map
 from r3jax.mapping.update import integrate_growing
 from r3jax.planning.far import Views, arrived, far_arrays, far_of, first_far, weigh_far, with_views
@@ -167,6 +167,8 @@ def test_other_policies_and_positions_are_refused():
     planner = r3jax.start(CAMERA, policy=a_policy(), config=CONFIG)
     with pytest.raises(InputError, match="subtract an origin"):
         at_hand(planner, np.array([500_000.0, 5_600_000.0, 100.0]))  # UTM
+    with pytest.raises(InputError, match=r"tile_folder.*bounds"):
+        r3jax.start(CAMERA, HALL, a_policy(), tile_folder="unused")
     with pytest.raises(InputError, match="polygons"):
         r3jax.keep_out(planner, np.zeros(planner.grid.log_odds.shape[:2], bool))
 
@@ -197,13 +199,24 @@ def test_a_hall_is_explored_to_its_end_by_tiles(tmp_path):
     assert len(first.far.tiles.voxels) == 0  # planners share tiles and change none
 
     r3jax.save(planner, tmp_path / "saved")
-    again = r3jax.load(tmp_path / "saved")
+    scratch = tmp_path / "scratch"
+    again = r3jax.load(tmp_path / "saved", tile_folder=scratch, tile_memory=0)
+    assert not again.far.tiles.voxels.memory
     assert_same_map(whole_map(again.map_state, again.far.tiles), whole)
     back = pose_at([2.0, 2.0, 1.3], 180.0, 0.0)
     frame = frame_in_room(CAMERA, back, room=HALL)
     frame = r3jax.Frame.from_arrays(frame.rgb, frame.depth, back, CAMERA)
     ends = [r3jax.decide(r3jax.observe(p, frame), back, KEY)[0] for p in (planner, again)]
     np.testing.assert_array_equal(ends[0].T_world_camera, ends[1].T_world_camera)
+
+    for path in scratch.rglob("*.tile"):
+        path.unlink()
+    with pytest.raises(PathError, match=r"r3jax\.rebuild"):
+        at_hand(again, back[:3, 3])
+    rebuilt = r3jax.rebuild(again, [frame])
+    assert rebuilt.far.tiles.folder is again.far.tiles.folder
+    alone = integrate_growing(first_map(planner.config), frame, CONFIG.max_range)
+    assert_same_map(rebuilt.whole_map, alone)
 
 
 def test_what_is_known_of_far_places_can_be_stored():

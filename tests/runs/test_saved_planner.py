@@ -10,6 +10,7 @@ import r3jax
 from r3jax.files import NotOursError
 from r3jax.planning.robot.motion import make_motion
 from r3jax.runs.header import RunError
+from r3jax.validation.json_text import sealed, unsealed
 
 CAMERA = r3jax.Camera.from_fov(48, 36, 70.0)
 BOUNDS = np.array([[0.0, 0.0, 0.0], [4.0, 3.0, 2.5]])
@@ -69,7 +70,7 @@ def test_damage_is_refused_by_name(planner, tmp_path):
     r3jax.save(planner, folder)
     text = (folder / "planner.json").read_text()
     for change, name in (
-        (lambda t: t.replace('"version": 1', '"version": 9'), "version"),
+        (lambda t: t.replace('"version": 2', '"version": 9'), "version"),
         (lambda t: t.replace('"cell_size": 0.2', '"cell_size": 0.3'), "planner.json"),
         (lambda t: t[: len(t) // 2], "planner.json"),
         (lambda t: json.dumps({"format": "other"}), "planner.json"),
@@ -88,3 +89,12 @@ def test_damage_is_refused_by_name(planner, tmp_path):
         r3jax.load(folder)
     with pytest.raises(RunError, match="missing"):
         r3jax.load(tmp_path / "nowhere")
+
+
+def test_the_first_version_is_still_read(planner, tmp_path):
+    planner, _ = planner
+    r3jax.save(planner, tmp_path)
+    plain = unsealed(json.loads((tmp_path / "planner.json").read_text()))
+    (tmp_path / "planner.json").write_text(json.dumps(sealed(plain | {"version": 1})))
+    again = r3jax.load(tmp_path)
+    assert int(again.map_state.num_present) == int(planner.map_state.num_present) > 0
