@@ -8,6 +8,7 @@ Shape symbols: X Y Z cells of the grid; C candidates; K waypoints.
 """
 
 import functools
+import itertools
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator
@@ -78,6 +79,9 @@ class PlannerState(eqx.Module):
 
     taken: Float[np.ndarray, "V 6"] | None = None
     """Positions and viewing directions of the views taken so far; None for a free-flying camera."""
+
+    driven: Float[np.ndarray, "P 2"] | None = None
+    """Places along the paths of a robot on the floor [m]; None for other motions."""
 
 
 @dataclass(frozen=True)
@@ -389,7 +393,8 @@ def travel_of(
     stood = headings = None
     if state.taken is not None:
         stood, headings = (state.taken[:, i : i + 2].astype(np.float64) for i in (0, 3))
-    room = room_for(body, grid, voxels, size, pose, state.camera, trail, stood, headings)
+    driven = state.driven
+    room = room_for(body, grid, voxels, size, pose, state.camera, trail, stood, headings, driven)
     travel = plan_travel(grid, position, trail=trail, heights=heights, room=room)
     places = position[None, :2] if stood is None else np.concatenate([position[None, :2], stood])
     return replace(travel, fresh=fresh_columns(travel, trail, places))
@@ -470,13 +475,33 @@ def initial_state(
     start_height = jnp.asarray(jnp.nan, dtype=jnp.float32) if is_relative else None
     # None for a free camera, as stored by earlier versions.
     taken = None if motion is None or motion == Motion() else np.zeros((0, 6), np.float32)
-    return PlannerState(camera, nowhere, looks, start_height, memory, taken)
+    is_standing = motion is not None and stands(motion)
+    driven = np.zeros((0, 2), np.float32) if is_standing else None
+    return PlannerState(camera, nowhere, looks, start_height, memory, taken, driven)
 
 
 def with_path(state: PlannerState, travel: Travel, waypoints: np.ndarray) -> PlannerState:
-    """Adds the cells of a path over waypoints [K, 3] [m] to the trail."""
+    """Adds a path over waypoints [K, 3] [m] to the trail."""
     # All cells that the lines cross, not only the waypoints: the path back must be connected.
-    return replace(state, trail=state.trail | travel.cells_along(waypoints))
+    state = replace(state, trail=state.trail | travel.cells_along(waypoints))
+    if state.driven is None:
+        return state
+    places = np.concatenate([state.driven, _places_along(waypoints[:, :2])])
+    _, first = np.unique(np.floor(places / _SPACING), axis=0, return_index=True)
+    return replace(state, driven=places[np.sort(first)])
+
+
+_SPACING = 0.05
+"""Places of a path are stored so far apart [m]."""
+
+
+def _places_along(waypoints: np.ndarray) -> np.ndarray:
+    """Places at most `_SPACING` apart along a path over waypoints [K, 2] [m], [n, 2] float32."""
+    parts = [waypoints[:1]]
+    for a, b in itertools.pairwise(waypoints):
+        num = max(int(np.ceil(np.linalg.norm(b - a) / _SPACING)), 1)
+        parts.append(a + (np.arange(1, num + 1) / num)[:, None] * (b - a))
+    return np.concatenate(parts).astype(np.float32)
 
 
 def _with_start(state: PlannerState, height: float) -> PlannerState:

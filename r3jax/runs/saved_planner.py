@@ -38,7 +38,14 @@ from r3jax.planning.planner import Planner, a_planner
 from r3jax.planning.registry import config_class, make_policy
 from r3jax.planning.robot.motion import motion_of_record
 from r3jax.runs.header import RunError, camera_fields, policy_fields
-from r3jax.runs.stored_states import fill, from_storable, map_tables, named_arrays, to_storable
+from r3jax.runs.stored_states import (
+    fill,
+    from_storable,
+    map_tables,
+    memory_of,
+    named_arrays,
+    to_storable,
+)
 from r3jax.scoring.config import scoring_config_of
 from r3jax.validation.errors import ForeignFileError
 from r3jax.validation.files import read_bytes
@@ -191,6 +198,6 @@ def _planner_of(
     like = OccupancyGrid(small.log_odds, small.origin, small.cell_size, **extra)
     grid = fill(like, tables["grid"])
     first = policy.init(camera, grid, key=jax.random.key(0))
-    policy_state = fill(first, tables.get("policy", {}))
+    policy_state = memory_of(first, tables)
     far = far_of(tables["far"], config, camera) if config.tiles else None
     return Planner(map_state, grid, policy_state, policy, config, far=far)

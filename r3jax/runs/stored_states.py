@@ -235,7 +235,6 @@ def state_of(tables: Tables, like: LoopState) -> LoopState:
     Raises:
         ValueError: a table or an array is missing or of another type.
     """
-    # Not `policy`: a policy without memory has no such table.
     missing = sorted({"map", "grid", "loop"} - set(tables))
     if missing:
         raise InputError(f"the checkpoint is missing {', '.join(missing)}")
@@ -250,9 +249,18 @@ def state_of(tables: Tables, like: LoopState) -> LoopState:
         like.planner,
         map_state=fill(like.map_state, arrays),
         grid=fill(like.grid, tables["grid"]),
-        policy_state=fill(like.policy_state, tables.get("policy", {})),
+        policy_state=memory_of(like.policy_state, tables),
     )
     return LoopState(planner=planner, **fill(rest, _LATER | dict(tables["loop"])))
+
+
+def memory_of(like: Any, tables: Tables) -> Any:
+    """Restores a policy's memory from the tables of a state, like `fill`."""
+    arrays = dict(tables.get("policy", {}))  # a policy without memory has no such table
+    driven = getattr(like, "driven", None)
+    if driven is not None:  # checkpoints of the first robots on the floor do not have it
+        arrays.setdefault("driven", driven)
+    return fill(like, arrays)
 
 
 def named_arrays(tree: Any) -> dict[str, np.ndarray]:

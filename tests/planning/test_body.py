@@ -181,6 +181,30 @@ def test_unknown_floor_is_trusted_round_the_first_place_only():
     assert not np.isfinite(room.cost[12]).any()
 
 
+corners = st.lists(st.tuples(*[st.integers(2, 17)] * 2), min_size=2, max_size=5, unique=True)
+
+
+@given(corners=corners, radius=st.floats(0.1, 0.35))
+@settings(max_examples=30, deadline=None)
+def test_a_driven_path_leads_back_until_something_is_measured_on_it(corners, radius):
+    """Whatever the cells say: nothing else is known here."""
+    path = (np.array(corners) + 0.5) * CELL
+    ends = list(itertools.pairwise(path))
+    driven = np.concatenate([a + np.linspace(0, 1, 200)[:, None] * (b - a) for a, b in ends])
+    first = tuple(np.floor((path[0] + CELL) / CELL).astype(int))
+
+    def back(driven, voxels) -> float:
+        grid, here = grid_of(np.zeros(SHAPE, bool)), pose_at(*path[-1])
+        body = Body(radius, floor=0.0)
+        return room_for(body, grid, voxels, VOXEL, here, driven=driven).cost[first]
+
+    none = np.zeros((0, 3))
+    assert back(driven, none) <= 1.1 * sum(np.linalg.norm(b - a) for a, b in ends) + CELL
+    if np.linalg.norm(path[0] - path[-1]) > 2 * radius + 2 * CELL:
+        assert not np.isfinite(back(None, none))
+        assert not np.isfinite(back(driven, pole(*path[0])))
+
+
 @pytest.mark.parametrize("height", [0.2, HEIGHT])
 def test_a_thin_thing_that_the_map_does_not_hold_is_an_obstacle(height):
     """Also of a body that is no taller than the cells that hold the floor."""

@@ -11,7 +11,7 @@ above, like Nav2's obstacle layer, and computes the distance of each point to al
 - what is not known. A column of cells is known if all that the body takes up of it is free, a
   pixel of it also if the floor was seen there: the voxels say what stands beside it. A voxel says
   nothing of the rest of its cell: behind the seen side of a wall is its other side. Where the robot
-  has stood is known, too.
+  has stood and driven is known, too.
 
 Cells below the camera that it cannot see count as `unknown_below` says.
 
@@ -138,6 +138,7 @@ def room_for(
     trail: np.ndarray | None = None,
     stood: np.ndarray | None = None,
     headings: np.ndarray | None = None,
+    driven: np.ndarray | None = None,
 ) -> Room:
     """Makes the plan for a body with a footprint.
 
@@ -151,6 +152,7 @@ def room_for(
         trail: cells that the robot has come through, [X, Y, Z] bool.
         stood: where its views were taken, the first one first, [V, 2] [m]; None: here only.
         headings: viewing directions of these views, [V, 2]; None: any.
+        driven: places along the driven paths, [P, 2] [m].
     """
     known = _Known.of(body, grid, voxels, voxel_size, T_world_camera, trail)
     thin = known.thin_obstacles()
@@ -174,14 +176,15 @@ def room_for(
     low, position = known.origin, known.position
     x, y = (low[i] + pixel * (np.arange(passable.shape[i]) + 0.5) for i in range(2))
     own = np.hypot(x[:, None] - position[0], y[None, :] - position[1])
-    # Where the robot stands and has stood is known, whatever the cells say.
+    # Where the robot stands and what it has swept is known, whatever the cells say: a doorway that
+    # it has driven through must not close behind it.
     is_own = own <= body.needed + pixel
-    for place in () if stood is None else stood:
-        # A window round the place: a mission has hundreds of them.
-        begin = np.floor((place - body.needed - low[:2]) / pixel).astype(int).clip(0)
-        i, j = (slice(k, k + int(2 * body.needed / pixel) + 2) for k in begin)
-        gap = np.hypot(x[i, None] - place[0], y[None, j] - place[1])
-        passable[i, j] |= gap <= body.needed
+    swept = [places for places in (stood, driven) if places is not None]
+    if swept:
+        centers = np.floor((np.concatenate(swept) - low[:2]) / pixel).astype(int)
+        # A pixel more: a diagonal step needs the pixels on both sides of it.
+        reach = body.needed / pixel + 1.0
+        passable |= _disks(np.unique(centers, axis=0), reach, passable.shape)
     closed = ~(passable & by_pixel(~thin) | is_own)
     if grid.closed is not None:
         closed |= by_pixel(grid.closed.any(axis=2))
@@ -459,6 +462,17 @@ class _Known:
         )
         found[window] &= _closed(known[window], gap)
         return found
+
+
+def _disks(centers: np.ndarray, radius: float, shape: tuple[int, ...]) -> np.ndarray:
+    """Marks the pixels of a plan that lie within disks round pixels [n, 2], `shape` bool."""
+    side = np.arange(-int(radius), int(radius) + 1)
+    offsets = np.argwhere(np.hypot(side[:, None], side[None, :]) <= radius) - int(radius)
+    pixels = (centers[:, None] + offsets).reshape(-1, 2)
+    pixels = pixels[np.all((pixels >= 0) & (pixels < shape), axis=1)]
+    found = np.zeros(shape, bool)
+    found[tuple(pixels.T)] = True
+    return found
 
 
 def _edt(mask: np.ndarray) -> np.ndarray:
