@@ -21,12 +21,12 @@ def room_file(tmp_path_factory):
     return path
 
 
-def test_there_are_nine_embedded_scenes_each_with_a_line_about_it():
+def test_there_are_ten_embedded_scenes_each_with_a_line_about_it():
     names = registry.scene_names()
-    assert len(names) == len(set(names)) == 9
+    assert len(names) == len(set(names)) == 10
     lines = [registry.describe(name) for name in names]
     assert all(lines)
-    assert len(set(lines)) == 9
+    assert len(set(lines)) == 10
 
 
 @pytest.mark.full

@@ -1,11 +1,12 @@
-"""Nine furnished scenes, made by code: fixed by name, the same on every run.
+"""Furnished scenes, made by code: nine homes and offices, and a tower of three storeys.
 
     from r3jax.simulators.scenes import procedural
     world = procedural.build("flat")
 
-Every scene is closed (a camera inside sees surfaces only), has image-like textures, glossy and
-mirror-like materials, windows on which depth sensors fail, and doorways that a robot of 0.3 m
-radius passes. World: z up, meters; one room's floor has a corner at the origin.
+They are fixed by name, the same on every run. Every scene is closed (a camera inside sees surfaces
+only), has image-like textures, glossy and mirror-like materials, windows on which depth sensors
+fail, and doorways that a robot of 0.3 m radius passes. World: z up, meters; one room's floor has a
+corner at the origin.
 """
 
 import importlib
@@ -24,12 +25,13 @@ _SCENES = {
     "corridor": "corridor",
     "classroom": "classroom",
     "library": "library",
+    "tower": "tower",
 }
 """Names, and the files of the catalog that make them; these load on first use."""
 
 
 def names() -> tuple[str, ...]:
-    """Lists the nine names, from the demo's scene on."""
+    """Lists the names, from the demo's scene on; the last is a tower, larger than a house."""
     return tuple(_SCENES)
 
 
@@ -41,7 +43,7 @@ def _scene(name: str):
 
 
 def build(name: str) -> World:
-    """Makes the scene of that name; the first in a process takes one to two seconds.
+    """Makes the scene of that name in one to two seconds, the tower in some more.
 
     Raises:
         ValueError: no scene has that name.

@@ -41,6 +41,10 @@ class Room:
     floor: Finish
     ceiling: Finish
     height: Real = 2.6
+    base: Real = 0.0
+    """Height of the floor [m]: rooms of several storeys lie in one plan."""
+    cell: Real = _CELL
+    """Largest cell of its surfaces [m]: how finely their corners are shaded."""
     sides: dict[str, Finish] = field(default_factory=dict[str, Finish])
     """Other finishes for single walls: "n", "e", "s", "w"."""
     wainscot: tuple[Real, Finish] | None = None
@@ -83,6 +87,7 @@ class FloorPlan:
         height: Real = DOOR_HEIGHT,
         frame: Finish | None = None,
         floor: Finish | None = None,
+        base: Real = 0.0,
     ) -> None:
         """Cuts a doorway through the wall between two rooms.
 
@@ -94,22 +99,23 @@ class FloorPlan:
             height: clear height [m].
             frame: finish of reveal and casing; painted white if not given.
             floor: finish of the threshold; oak if not given.
+            base: height of the threshold [m].
         """
         finish = frame or f.enamel(f.WHITE, 3, 0.2)
-        lo, hi = center - width / 2, center + width / 2
-        box_low, box_high = (gap[0], lo, 0.0), (gap[1], hi, height)
+        lo, hi, top = center - width / 2, center + width / 2, base + height
+        box_low, box_high = (gap[0], lo, base), (gap[1], hi, top)
         if axis == "y":
-            box_low, box_high = (lo, gap[0], 0.0), (hi, gap[1], height)
+            box_low, box_high = (lo, gap[0], base), (hi, gap[1], top)
         self.openings.append(Opening(box_low, box_high))
-        tunnel = _tunnel(axis, gap, (lo, hi), (0.0, height))
+        tunnel = _tunnel(axis, gap, (lo, hi), (base, top))
         self.model.add(tunnel[0], floor or f.wood(f.OAK, 8)).add(combine(tunnel[1:]), finish)
         casing = 0.07
         for face, out in ((gap[0], -0.018), (gap[1], 0.018)):
             a, b = sorted((face, face + out))
             for s0, s1, z0, z1 in (
-                (lo - casing, lo, 0.0, height + casing),
-                (hi, hi + casing, 0.0, height + casing),
-                (lo, hi, height, height + casing),
+                (lo - casing, lo, base, top + casing),
+                (hi, hi + casing, base, top + casing),
+                (lo, hi, top, top + casing),
             ):
                 bar = (
                     box((a, s0, z0), (b, s1, z1)) if axis == "x" else box((s0, a, z0), (s1, b, z1))
@@ -126,22 +132,23 @@ class FloorPlan:
             side: its wall, "n", "e", "s" or "w".
             center: middle of the window along the wall [m].
             width: clear width [m].
-            sill: height of the lower edge [m].
-            top: height of the upper edge [m].
+            sill: height of the lower edge above the floor [m].
+            top: height of the upper edge above the floor [m].
             view: seed of the view outside.
         """
         r = self.rooms[room]
+        base = r.base
         face, out = {"n": (r.y1, 1), "s": (r.y0, -1), "e": (r.x1, 1), "w": (r.x0, -1)}[side]
         axis = "y" if side in "ns" else "x"
         depth = 0.7 * OUTER_WALL
         gap = (min(face, face + out * depth), max(face, face + out * depth))
         lo, hi = center - width / 2, center + width / 2
-        low, high = (gap[0], lo, sill), (gap[1], hi, top)
+        low, high = (gap[0], lo, base + sill), (gap[1], hi, base + top)
         if axis == "y":
-            low, high = (lo, gap[0], sill), (hi, gap[1], top)
+            low, high = (lo, gap[0], base + sill), (hi, gap[1], base + top)
         self.openings.append(Opening(low, high))
         white = f.enamel(f.WHITE, 4, 0.3)
-        self.model.add(combine(_tunnel(axis, gap, (lo, hi), (sill, top))), white)
+        self.model.add(combine(_tunnel(axis, gap, (lo, hi), (base + sill, base + top))), white)
 
         # The rest is built facing +y and turned to face into the room.
         pane = Model()
@@ -159,14 +166,14 @@ class FloorPlan:
         pane.add(board, f.marble((0.86, 0.85, 0.82), (0.5, 0.5, 0.5), 21))
         inward = {"n": "s", "s": "n", "e": "w", "w": "e"}[side]
         x, y = (face + out * depth, center) if axis == "x" else (center, face + out * depth)
-        self.model.put(pane, x, y, 0.0, inward)
+        self.model.put(pane, x, y, base, inward)
 
     def build(self) -> Model:
         """Builds walls, floors, ceilings, skirtings and the outer shell, with all openings cut."""
         for room in self.rooms.values():
             self._room_surfaces(room)
         corners = np.array(
-            [[(r.x0, r.y0, 0.0), (r.x1, r.y1, r.height)] for r in self.rooms.values()]
+            [[(r.x0, r.y0, r.base), (r.x1, r.y1, r.base + r.height)] for r in self.rooms.values()]
         )
         low, high = corners[:, 0].min(axis=0) - OUTER_WALL, corners[:, 1].max(axis=0) + OUTER_WALL
         shell = box(tuple(low), tuple(high), upright=True, step=2.0)
@@ -175,24 +182,25 @@ class FloorPlan:
 
     def _room_surfaces(self, r: Room) -> None:
         dx, dy = r.x1 - r.x0, r.y1 - r.y0
-        self.model.add(quad((r.x0, r.y0, 0), (dx, 0, 0), (0, dy, 0), _CELL), r.floor)
-        self.model.add(quad((r.x0, r.y1, r.height), (dx, 0, 0), (0, -dy, 0), _CELL), r.ceiling)
+        top = r.base + r.height
+        self.model.add(quad((r.x0, r.y0, r.base), (dx, 0, 0), (0, dy, 0), r.cell), r.floor)
+        self.model.add(quad((r.x0, r.y1, top), (dx, 0, 0), (0, -dy, 0), r.cell), r.ceiling)
         for side in "nesw":
             holes = self._holes(r, side)
             finish = r.sides.get(side, r.wall)
-            bottom = 0.0
+            bottom = r.base
             if r.wainscot is not None:
-                bottom, lower = r.wainscot
-                self.model.add(_wall(r, side, 0.0, bottom, holes), lower)
+                bottom, lower = r.base + r.wainscot[0], r.wainscot[1]
+                self.model.add(_wall(r, side, r.base, bottom, holes), lower)
                 self._rail(r, side, bottom, holes)
-            self.model.add(_wall(r, side, bottom, r.height, holes), finish)
+            self.model.add(_wall(r, side, bottom, top, holes), finish)
             if r.skirting is not None:
-                self._strip(r, side, (0.0, 0.09), 0.015, holes, r.skirting)
+                self._strip(r, side, (r.base, r.base + 0.09), 0.015, holes, r.skirting)
 
     def _rail(self, r: Room, side: str, z: Real, holes: list[_Hole]) -> None:
         finish = r.skirting or f.enamel(f.WHITE, 3, 0.2)
         blocking = [
-            (a, b, 0.0 if c < z + 0.02 and d > z - 0.02 else 9.0, d) for a, b, c, d in holes
+            (a, b, z - 1.0 if c < z + 0.02 and d > z - 0.02 else z + 9.0, d) for a, b, c, d in holes
         ]
         self._strip(r, side, (z - 0.02, z + 0.02), 0.018, blocking, finish)
 
@@ -230,6 +238,7 @@ class FloorPlan:
         holes: list[_Hole] = []
         for o in self.openings:
             touches = min(abs(o.low[across] - face), abs(o.high[across] - face)) < 1e-6
+            touches &= o.high[2] > r.base and o.low[2] < r.base + r.height
             if touches and o.low[along] > lo - 1e-6 and o.high[along] < hi + 1e-6:
                 holes.append((o.low[along], o.high[along], o.low[2], o.high[2]))
         return holes
@@ -238,8 +247,8 @@ class FloorPlan:
 def _wall(r: Room, side: str, z0: Real, z1: Real, holes: list[_Hole]) -> Shape:
     """Builds one wall between two heights, seen from inside, without its openings."""
     lo, hi = (r.x0, r.x1) if side in "ns" else (r.y0, r.y1)
-    s = _ticks(lo, hi, [v for a, b, _, _ in holes for v in (a, b)])
-    t = _ticks(z0, z1, [v for _, _, c, d in holes for v in (c, d)])
+    s = _ticks(lo, hi, [v for a, b, _, _ in holes for v in (a, b)], r.cell)
+    t = _ticks(z0, z1, [v for _, _, c, d in holes for v in (c, d)], r.cell)
     origin, along = {
         "n": ((0.0, r.y1), (1.0, 0.0)),
         "s": ((0.0, r.y0), (-1.0, 0.0)),
@@ -264,11 +273,11 @@ def _wall(r: Room, side: str, z0: Real, z1: Real, holes: list[_Hole]) -> Shape:
     return Shape(shape.corners[keep], shape.uv[keep])
 
 
-def _ticks(lo: Real, hi: Real, cuts: list[Real]) -> np.ndarray:
+def _ticks(lo: Real, hi: Real, cuts: list[Real], cell: Real) -> np.ndarray:
     inner = [c for c in cuts if lo < c < hi]
     stops = np.unique(np.round([lo, hi, *inner], 9))
     parts = [
-        np.linspace(a, b, int(np.ceil((b - a) / _CELL)) + 1)[:-1]
+        np.linspace(a, b, int(np.ceil((b - a) / cell)) + 1)[:-1]
         for a, b in itertools.pairwise(stops)
     ]
     return np.concatenate([*parts, [hi]])

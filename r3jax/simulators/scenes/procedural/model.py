@@ -199,8 +199,7 @@ def ambient_occlusion(corners: np.ndarray) -> np.ndarray:
         [F, 3], from 0.4 (deep in a corner) to 1 (open).
     """
     origin = corners.min(axis=(0, 1)) - 3 * _VOXEL
-    size = np.ceil((corners.max(axis=(0, 1)) - origin) / _VOXEL).astype(int) + 4
-    filled = _splat(corners, origin, size)
+    filled = surface_voxels(corners, origin, _VOXEL).astype(np.float32)
     edge_a, edge_b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(edge_a, edge_b)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
@@ -217,21 +216,37 @@ def ambient_occlusion(corners: np.ndarray) -> np.ndarray:
     return np.clip(light, 0.4, 1.0)
 
 
-def _splat(corners: np.ndarray, origin: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Marks voxels that any surface touches, [X, Y, Z] float32 of 0 and 1."""
+def surface_voxels(corners: np.ndarray, origin: np.ndarray, voxel: float) -> np.ndarray:
+    """Marks the voxels that any surface touches, [X, Y, Z] bool.
+
+    Args:
+        corners: of triangles, [F, 3, 3] [m].
+        origin: lower corner of voxel (0, 0, 0), below all of them [3] [m].
+        voxel: edge of a voxel [m].
+    """
+    size = np.ceil((corners.max(axis=(0, 1)) - origin) / voxel).astype(int) + 4
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = 0.5 * np.linalg.norm(normal, axis=1)
-    counts = np.ceil(4.0 * area / _VOXEL**2).astype(int)
-    face = np.repeat(np.arange(len(corners)), counts)
-    k = np.arange(len(face)) - np.repeat(np.cumsum(counts) - counts, counts)
-    # The R2 sequence spreads the points of each triangle evenly; fold the square in two.
-    a, b = (0.5 + 0.7548776662466927 * k) % 1.0, (0.5 + 0.5698402909980532 * k) % 1.0
-    outside = a + b > 1.0
-    a, b = np.where(outside, 1.0 - a, a), np.where(outside, 1.0 - b, b)
-    scaled = ((corners - origin) / _VOXEL).astype(np.float32)
+    counts = np.ceil(4.0 * area / voxel**2).astype(int)
+    scaled = ((corners - origin) / voxel).astype(np.float32)
     start, edges = scaled[:, 0], scaled[:, 1:] - scaled[:, :1]
-    points = start[face] + a[:, None] * edges[face, 0] + b[:, None] * edges[face, 1]
-    index = points.astype(int)
-    filled = np.zeros(tuple(size), dtype=np.float32)
-    filled[index[:, 0], index[:, 1], index[:, 2]] = 1.0
+    filled = np.zeros(tuple(size), dtype=bool)
+    # A million points at a time: a tower has 20 million.
+    for faces in np.split(np.arange(len(corners)), _cuts(counts, 1 << 20)):
+        num = counts[faces]
+        face = np.repeat(faces, num)
+        k = np.arange(len(face)) - np.repeat(np.cumsum(num) - num, num)
+        # The R2 sequence spreads the points of each triangle evenly; fold the square in two.
+        a, b = (0.5 + 0.7548776662466927 * k) % 1.0, (0.5 + 0.5698402909980532 * k) % 1.0
+        outside = a + b > 1.0
+        a, b = np.where(outside, 1.0 - a, a), np.where(outside, 1.0 - b, b)
+        points = start[face] + a[:, None] * edges[face, 0] + b[:, None] * edges[face, 1]
+        x, y, z = points.astype(int).T
+        filled[x, y, z] = True
     return filled
+
+
+def _cuts(counts: np.ndarray, most: int) -> np.ndarray:
+    """Finds where to cut a list so that the counts of each part sum to about `most`."""
+    part = np.cumsum(counts) // most
+    return np.flatnonzero(np.diff(part)) + 1

@@ -1,1 +1,1 @@
-"""The nine scenes, one file each: `build()` makes the world, `SUMMARY` describes it."""
+"""The scenes, one file each: `build()` makes the world, `SUMMARY` describes it."""
