@@ -1,44 +1,63 @@
-"""Explores a floor of many rooms by tiles: cost of each step, memory, and a plan of what was found.
+"""Explores places larger than a house by tiles, and walks through one for an audit.
 
-    python -m experiments.campus --rooms 6 --views 200
+    python -m experiments.campus explore --scene tower --views 400
+    python -m experiments.campus explore --rooms 6 --views 200
+    python -m experiments.campus walk --frames 1000
 
-Rooms of 6 m with doors in every wall and some boxes, drawn by the ray caster; `r3-pano` starts in a
-corner, without bounds but for floor and ceiling. A row of `steps.jsonl` for each view.
+`explore` records a run as `r3jax explore --tiles` does, with `r3-pano`, and beside it what each
+view took: a row of `steps.jsonl`, and a picture of the floors, the coverage and the memory. The
+campus has rooms of 6 m with doors in every wall and some boxes; other places are embedded scenes.
+`walk` writes a capture of a walk through the rooms of a campus, of 20 frames a room, for
+`r3jax audit`.
 """
 
 import json
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import trimesh
 import tyro
+from matplotlib.figure import Figure
+from PIL import Image
 
 import r3jax
 from experiments.world_size import DOOR, HEIGHT, ROOM
+from r3jax.exploration.config import ExplorationConfig, parse_budget
+from r3jax.exploration.loop import explore
 from r3jax.exploration.state import compilations
-from r3jax.mapping.occupancy import FREE_LOG_ODDS, OCCUPIED_LOG_ODDS
-from r3jax.mapping.tiles import unpacked_layer
+from r3jax.exploration.taken_views import TakenView, to_integers
+from r3jax.formats.nerfstudio import OPENGL_FROM_OPENCV
 from r3jax.mapping.update import integrate_growing
-from r3jax.planning.far import Far
 from r3jax.planning.planner import Planner, first_map
+from r3jax.runs.begin import begin_run, resume_run
+from r3jax.runs.settings import RunSettings, SceneSettings
 from r3jax.simulators.scenes.registry import open_scene
 
 _WALL = 0.1
 
+_EYES = {"tower": (1.3, 4.6, 7.9)}
+"""Heights of the floor plans of scenes of several storeys [m]."""
+
 
 @dataclass(frozen=True)
-class Options:
-    """What to explore."""
+class Explore:
+    """Explore a place by tiles."""
+
+    scene: str = "rooms"
+    """`rooms`, or an embedded scene."""
 
     rooms: int = 6
-    """Rooms along each side."""
+    """Rooms along each side of a campus."""
 
     views: int = 200
     """Views to take."""
+
+    capture_every: float | None = None
+    """Capture frames while moving, at most this far apart [m]."""
 
     edge: int = 128
     """Width and height of the images [px]."""
@@ -49,8 +68,28 @@ class Options:
     check: bool = False
     """Map all frames in one table, too, and compare it with the tiles at the end."""
 
+    resume: bool = False
+    """Go on with the run in the folder, to more views."""
+
     out: Path = Path("experiments/results/campus")
-    """Folder of the rows and the plan."""
+    """Folder of the run, the rows and the picture."""
+
+
+@dataclass(frozen=True)
+class Walk:
+    """Write a capture of a walk through the rooms of a campus."""
+
+    frames: int = 1000
+    """Frames, 20 a room."""
+
+    width: int = 320
+    """Width of the images [px]; the height is three quarters of it."""
+
+    seed: int = 0
+    """Of the boxes and the colors."""
+
+    out: Path = Path("experiments/results/campus/walk")
+    """Folder of the capture."""
 
 
 def boxes(rooms: int, seed: int) -> list[np.ndarray]:
@@ -94,70 +133,6 @@ def write_world(path: Path, rooms: int, seed: int) -> str:
     return f"mesh:{path}"
 
 
-def plan_of(planner: Planner, height: float, side: float) -> np.ndarray:
-    """Assembles a level slice of all cells: 0 unknown, 1 free, 2 occupied, [x, y]."""
-    far = planner.far
-    assert far is not None
-    lattice = far.tiles.lattice
-    layer = int((height - lattice.origin[2]) / lattice.cell_size)
-    num = int(np.ceil(side / lattice.cell_size))
-    plan = np.zeros((num, num), np.float32)
-
-    def put(values: np.ndarray, first: np.ndarray) -> None:
-        for x, y in np.ndindex(values.shape[:2]):
-            i, j = first[0] + x, first[1] + y
-            if 0 <= i < num and 0 <= j < num:
-                plan[i, j] = values[x, y, layer]
-
-    for tile, layers in far.tiles.cells.items():
-        if "log_odds" in layers:
-            put(unpacked_layer(layers["log_odds"], lattice.cells),
-                np.array(tile) * np.array(lattice.cells))  # fmt: skip
-    put(np.asarray(planner.grid.log_odds), far.first_cell)
-    return np.where(plan < FREE_LOG_ODDS, 1, np.where(plan > OCCUPIED_LOG_ODDS, 2, 0))
-
-
-def main(options: Options) -> Path:
-    """Explores, and writes rows and a plan."""
-    options.out.mkdir(parents=True, exist_ok=True)
-    side = options.rooms * ROOM
-    spec = write_world(options.out / "world.ply", options.rooms, options.seed)
-    camera = r3jax.Camera.from_fov(options.edge, options.edge, 75.0)
-    pose = np.asarray(r3jax.pose_along(np.array([2.6, 2.4, 1.3]), np.array([1.0, 0.6, 0.0])))
-    pose = pose.astype(np.float64)
-    simulator = open_scene(spec, camera=camera, start_pose=pose)
-    floor = [[-np.inf, -np.inf, -0.1], [np.inf, np.inf, HEIGHT + 0.1]]
-    planner = r3jax.start(camera, floor, starts=[pose])
-    rows, metres, places = [], 0.0, [pose[:3, 3]]
-    whole = first_map(replace(planner.config, capacity=1 << 20)) if options.check else None
-    for step in range(options.views):
-        frame = simulator.render(pose)
-        if whole is not None:
-            whole = integrate_growing(whole, frame, planner.config.max_range)
-        times = [time.process_time()]
-        planner = r3jax.observe(planner, frame)
-        jax.block_until_ready(planner.map_state)
-        times.append(time.process_time())
-        key = jax.random.fold_in(jax.random.key(options.seed), step)
-        decision, planner, info = r3jax.decide(planner, pose, key)
-        times.append(time.process_time())
-        rows.append(
-            row_of(planner, metres, times) | {"step": step, "position": pose[:3, 3].tolist()}
-        )
-        with open(options.out / "steps.jsonl", "a") as file:
-            file.write(json.dumps(rows[-1]) + "\n")
-        if decision is None:
-            print(info.outcome, info.reason)
-            break
-        metres += decision.length
-        places += list(decision.waypoints[1:])
-        pose = decision.T_world_camera
-    draw(planner, np.array(places), side, options.out / "plan.png")
-    if whole is not None:
-        print("differences", differences(planner.whole_map, whole))
-    return options.out
-
-
 def differences(a: r3jax.MapState, b: r3jax.MapState) -> dict[str, int]:
     """Counts the numbers in which two maps differ, voxel by voxel."""
     found = []
@@ -171,38 +146,170 @@ def differences(a: r3jax.MapState, b: r3jax.MapState) -> dict[str, int]:
     return {name: int((found[0][name] != found[1][name]).sum()) for name in found[0]}
 
 
-def row_of(planner: Planner, metres: float, times: list[float]) -> dict[str, Any]:
-    """Describes a step in numbers."""
-    far = planner.far
-    assert isinstance(far, Far)
-    return {
-        "observe": round(times[1] - times[0], 4),
-        "decide": round(times[2] - times[1], 4),
-        "metres": round(metres, 2),
+def go(options: Explore) -> Path:
+    """Explores, and writes the run, rows and a picture."""
+    options.out.mkdir(parents=True, exist_ok=True)
+    spec, start = options.scene, None
+    if spec == "rooms":
+        spec = write_world(options.out / "world.ply", options.rooms, options.seed)
+        start = (2.6, 2.4, 1.3)
+    camera = r3jax.Camera.from_fov(options.edge, options.edge, 75.0)
+    policy = r3jax.make_policy("r3-pano")
+    config = ExplorationConfig(tiles=True, capture_every=options.capture_every)
+    settings = RunSettings(parse_budget(f"views:{options.views}"), config, policy)
+    scene = SceneSettings(spec, camera, options.seed, start=start)
+    steps, rows = options.out / "steps.jsonl", list[dict[str, Any]]()
+    if options.resume:
+        expedition = resume_run(options.out / "run", str(settings.budget))
+        rows += map(json.loads, steps.read_text().splitlines())
+    else:
+        expedition = begin_run(settings, scene, options.out / "run", overwrite=True)
+        steps.unlink(missing_ok=True)
+    state = first_map(replace(config, capacity=1 << 20))
+    begin = time.perf_counter() - (rows[-1]["seconds"] if rows else 0.0)
+
+    def on_view(view: TakenView, planner: Planner) -> None:
+        nonlocal state
+        if options.check:
+            state = integrate_growing(
+                state, view.frame, config.max_range, drop_edges=config.drop_edges
+            )
+        rows.append(row_of(view, planner, time.perf_counter() - begin))
+        with open(steps, "a") as file:
+            file.write(json.dumps(rows[-1]) + "\n")
+
+    with expedition.recorder as recorder:
+        result = explore(
+            expedition.simulator,
+            policy,
+            budget=settings.budget,
+            seed=options.seed,
+            config=expedition.settings.config,
+            recorder=recorder,
+            resume=expedition.recorded,
+            on_view=on_view,
+        )
+    print(result.message)
+    heights = _EYES.get(options.scene, (1.3,))
+    draw(result.state.planner, rows, heights, options.out / "plan.png")
+    if options.check:
+        print("differences", differences(result.state.planner.whole_map, state))
+    return options.out
+
+
+def row_of(view: TakenView, planner: Planner, seconds: float) -> dict[str, Any]:
+    """Describes a view in numbers."""
+    far, row = planner.far, view.row
+    assert far is not None
+    path = [] if view.decision is None else view.decision.waypoints.round(2).tolist()
+    stages = {name: round(view.stages.get(name, 0.0), 4) for name in ("plan", "map", "measure")}
+    return stages | {
+        "step": row.step,
+        "captured": row.captured,
+        "position": row.pose[:3, 3].round(3).tolist(),
+        "path": path,
+        "seconds": round(seconds, 2),
+        "metres": round(row.metres, 2),
+        "known_share": round(row.coverage.known_share, 5),
         "rows": planner.map_state.capacity,
-        "active": int(planner.map_state.num_present),
-        "far": far.tiles.num_voxels,
+        "voxels": row.coverage.voxels,
         "far_bytes": far.tiles.nbytes,
         "views_left": len(far.views.path),
         "trail": len(far.trails),
         "compiled": compilations.count,
+        "memory": memory(),
     }
 
 
-def draw(planner: Planner, places: np.ndarray, side: float, path: Path) -> None:
-    """Draws the plan, and where the camera went."""
-    from matplotlib.figure import Figure
+def memory() -> int:
+    """Returns the resident memory of this process [bytes]."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * 4096
 
-    figure = Figure(figsize=(6.0, 6.0), layout="constrained")
-    axes = figure.subplots()
-    plan = plan_of(planner, 1.3, side)
-    shades = np.array([0.75, 1.0, 0.1])[plan]
-    axes.imshow(shades.T, cmap="gray", vmin=0, vmax=1, origin="lower", extent=(0, side, 0, side))
-    axes.plot(places[:, 0], places[:, 1], "-", color="tab:red", linewidth=0.8)
-    axes.plot(*places[0, :2], "o", color="tab:blue")
-    axes.set(xlabel="x [m]", ylabel="y [m]")
-    figure.savefig(path, dpi=120)
+
+def draw(
+    planner: Planner, rows: Sequence[dict[str, Any]], heights: Sequence[float], path: Path
+) -> None:
+    """Draws a plan of each floor with the path, and coverage and memory over the views."""
+    grid, num = planner.whole_grid, len(heights)
+    free, occupied = np.asarray(grid.free), np.asarray(grid.occupied)
+    origin, size = np.asarray(grid.origin, np.float64), float(grid.cell_size)
+    ends = origin[:2] + np.array(free.shape[:2]) * size
+    figure = Figure(figsize=(4.2 * max(num, 2), 8.4 if num > 1 else 7.0), layout="constrained")
+    upper, lower = np.ravel(figure.subfigures(2, 1, height_ratios=[1.45, 1.0]))
+    places = [np.array(row["path"] or [row["position"]]) for row in rows]
+    line = np.concatenate(places)
+    for axes, height in zip(upper.subplots(1, num, squeeze=False)[0], heights, strict=True):
+        z = int((height - origin[2]) / size)
+        shade = np.where(free[:, :, z], 1.0, np.where(occupied[:, :, z], 0.1, 0.75))
+        axes.imshow(shade.T, cmap="gray", vmin=0, vmax=1, origin="lower",
+                    extent=(origin[0], ends[0], origin[1], ends[1]))  # fmt: skip
+        near = np.abs(line[:, 2] - height) < 1.65
+        axes.plot(*np.where(near, line[:, :2].T, np.nan), "-", color="tab:red", linewidth=0.7)
+        if near[0]:
+            axes.plot(*line[0, :2], "o", color="tab:blue")
+        axes.set(xlabel="x [m]", ylabel="y [m]", title=f"at a height of {height:g} m")
+    step = np.arange(1, len(rows) + 1)
+    left, right = lower.subplots(1, 2)
+    left.plot(step, [100.0 * row["known_share"] for row in rows])
+    left.set(xlabel="frames", ylabel="cells of the box that are known [%]", ylim=(0, None))
+    right.plot(step, [row["memory"] / 1e6 for row in rows], label="process")
+    right.plot(step, [row["far_bytes"] / 1e6 for row in rows], label="tiles that are not active")
+    right.set(xlabel="frames", ylabel="memory [MB]", ylim=(0, None))
+    right.legend()
+    figure.savefig(path, dpi=110)
+
+
+def walked(rooms: int, frames: int) -> list[np.ndarray]:
+    """Lists poses through rooms in rows, back and forth: a turn in each, and steps of 0.5 m."""
+    poses: list[np.ndarray] = []
+    order = [(x if y % 2 == 0 else rooms - 1 - x, y) for y in range(rooms) for x in range(rooms)]
+    centers = (np.array(order) + 0.5) * ROOM
+    for here, there in zip(centers, [*centers[1:], centers[-1]], strict=True):
+        ahead = np.arctan2(*(there - here)[::-1]) if np.any(there != here) else 0.0
+        for k in range(8):
+            poses.append(_pose(here, ahead + k * np.pi / 4))
+        for k in range(1, 13):
+            aside = np.pi / 3 * (k % 3 - 1)
+            poses.append(_pose(here + (there - here) * k / 12, ahead + aside))
+    return poses[:frames]
+
+
+def _pose(place: np.ndarray, yaw: float) -> np.ndarray:
+    ahead = np.array([np.cos(yaw), np.sin(yaw), -0.15])
+    return np.asarray(r3jax.pose_along(np.append(place, 1.5), ahead), np.float64)
+
+
+def walk(options: Walk) -> Path:
+    """Renders the frames of a walk, and writes them as nerfstudio does."""
+    rooms = int(np.ceil(np.sqrt(options.frames / 20)))
+    for name in ("images", "depth"):
+        (options.out / name).mkdir(parents=True, exist_ok=True)
+    spec = write_world(options.out.parent / f"{options.out.name}.ply", rooms, options.seed)
+    poses = walked(rooms, options.frames)
+    camera = r3jax.Camera.from_fov(options.width, options.width * 3 // 4, 75.0)
+    simulator = open_scene(spec, camera=camera, start_pose=poses[0], seed=options.seed)
+    frames = []
+    for number, pose in enumerate(poses):
+        rgb, depth = to_integers(simulator.render(pose))
+        names = [f"{kind}/{number:06d}.png" for kind in ("images", "depth")]
+        for name, pixels in zip(names, (rgb, np.where(depth == 65535, 0, depth)), strict=True):
+            Image.fromarray(pixels.astype(rgb.dtype if pixels is rgb else np.uint16)).save(
+                options.out / name, compress_level=1
+            )
+        frames.append({"file_path": names[0], "depth_file_path": names[1],
+                       "transform_matrix": (pose @ OPENGL_FROM_OPENCV).tolist()})  # fmt: skip
+    lens = {"w": camera.width, "h": camera.height, "fl_x": float(camera.fx),
+            "fl_y": float(camera.fy), "cx": float(camera.cx), "cy": float(camera.cy)}  # fmt: skip
+    content = lens | {"depth_unit_scale_factor": 1.0 / 5000.0, "frames": frames}
+    (options.out / "transforms.json").write_text(json.dumps(content))
+    return options.out
+
+
+def main(options: Explore | Walk) -> Path:
+    """Does what a command says, and returns its folder."""
+    return go(options) if isinstance(options, Explore) else walk(options)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    print(main(tyro.cli(Explore | Walk, description=__doc__)))

@@ -212,11 +212,6 @@ class ExplorationConfig(MappingConfig):
     def __post_init__(self) -> None:
         """Refuses invalid settings."""
         super().__post_init__()
-        if self.tiles:
-            raise InputError(
-                "a run maps its scene as a whole: tiles are for planners of your own "
-                "(r3jax.start, observe, decide)"
-            )
         # Written so that NaN fails, too: it would make every flight time and the clock NaN.
         if not LEAST_RATE <= self.speed < math.inf:
             raise InputError(

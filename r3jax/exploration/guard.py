@@ -9,6 +9,7 @@ import numpy as np
 from r3jax.errors import InputError
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
+from r3jax.mapping.config import MappingConfig
 from r3jax.mapping.occupancy import MAX_CELLS
 from r3jax.planning.robot.limits import begin_at
 from r3jax.planning.robot.motion import Motion
@@ -24,20 +25,20 @@ _LEAST_HOUSE, _LARGEST_HOUSE = 2.0, 500.0
 """Usual extents of explored scenes [m]."""
 
 
-def first_pose(simulator: Simulator, motion: Motion, cell_size: float) -> np.ndarray:
+def first_pose(simulator: Simulator, motion: Motion, config: MappingConfig) -> np.ndarray:
     """Finds the pose of the first view, `T_world_camera` [4, 4] float64.
 
     Args:
         simulator: the world.
         motion: of the robot, which must be able to take that view.
-        cell_size: edge of a cell of the coarse grid [m].
+        config: cells of the coarse grid.
 
     Raises:
         ValueError: a start outside the world's box, or at a height that the robot cannot reach;
             a world that cannot be explored (see `check_world`).
     """
     # First: the errors of the search for a start and of the grid do not suggest a scale.
-    check_world(simulator.bounds, cell_size)
+    check_world(simulator.bounds, None if config.tiles else config.cell_size)
     pose = np.asarray(simulator.start_pose, dtype=np.float64)
     lower, upper = np.asarray(simulator.bounds, dtype=np.float64)
     # The grid ends just beyond the box: outside there are no cells.
@@ -49,12 +50,12 @@ def first_pose(simulator: Simulator, motion: Motion, cell_size: float) -> np.nda
     return begin_at(motion, pose)
 
 
-def check_world(bounds: np.ndarray, cell_size: float, setting: str = "--cell-size") -> None:
+def check_world(bounds: np.ndarray, cell_size: float | None, setting: str = "--cell-size") -> None:
     """Refuses a world that is too small, too flat or too large to be explored.
 
     Args:
         bounds: its box, [2, 3] [m].
-        cell_size: edge of a cell of the coarse grid [m].
+        cell_size: edge of a cell of the coarse grid [m]; None: of tiles, any number.
         setting: name of the user's setting of it.
 
     Raises:
@@ -74,12 +75,14 @@ def check_world(bounds: np.ndarray, cell_size: float, setting: str = "--cell-siz
         raise InputError(f"{size}: too small for a camera with {_LEAST_EXTENT / 2:g} m free{hint}")
     if not extent.min() >= _LEAST_HEIGHT:
         raise InputError(f"{size}: flat, with no space to explore")
+    if cell_size is None:
+        return
     # The grid has a cell more on every side, as walls lie on the faces of the box.
     cells = float(np.prod(extent / cell_size + 2.0))
     if not cells <= MAX_CELLS:
         raise InputError(
             f"{size}: {cells:.2g} cells of {cell_size:g} m, more than {MAX_CELLS:.0e}"
-            f"{hint or f'; give a larger {setting}, or cut the mesh'}"
+            f"{hint or f'; give a larger {setting}, cut the mesh, or explore with --tiles'}"
         )
 
 

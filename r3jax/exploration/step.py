@@ -28,6 +28,7 @@ from r3jax.frame import Frame
 from r3jax.geometry.cameras import angle_between
 from r3jax.planning.planner import (
     Planner,
+    at_hand,
     decide,
     decide_ahead,
     follow,
@@ -52,7 +53,7 @@ def start_state(
         ValueError: see `guard.first_pose`.
     """
     simulator, config = mission.simulator, mission.config
-    pose = first_pose(simulator, motion_of(mission.policy), config.cell_size)
+    pose = first_pose(simulator, motion_of(mission.policy), config)
     planner = start(
         simulator.camera,
         np.asarray(simulator.bounds, dtype=np.float64),
@@ -282,7 +283,8 @@ def _look(
     # Read here: what follows is bookkeeping, not time of the simulator.
     stages = stages | {"render": time.perf_counter() - begin}
     # On the map before the frame, for which the view was chosen.
-    arrival = view_renderability(state.map_state, frame.camera, frame.T_world_camera)
+    before_frame = at_hand(state.planner, np.asarray(frame.T_world_camera)[:3, 3]).map_state
+    arrival = view_renderability(before_frame, frame.camera, frame.T_world_camera)
 
     mission.on_stage("map")
     planner, measured = timed(
@@ -306,6 +308,7 @@ def _look(
         frame.camera,
         arrival_renderability=arrival,
         num_probes=mission.config.num_probes,
+        far=state.planner.far,
     )
     row = StepRow(
         step=state.views - 1,

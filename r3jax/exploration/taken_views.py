@@ -74,7 +74,8 @@ class Coverage:
     """Number of unexplored cells next to a free one."""
 
     mean_renderability: float
-    """Mean renderability of a fixed sequence of probe views inside known free space."""
+    """Mean renderability of a fixed sequence of probe views inside known free space; in a run with
+    tiles, of those round the camera."""
 
     arrival_renderability: float
     """Renderability of this view just before it was integrated; high if it repeats others."""

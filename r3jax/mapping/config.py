@@ -41,8 +41,8 @@ class MappingConfig:
     """Cell size of the coarse occupancy grid [m]."""
 
     tiles: bool = False
-    """Hold what lies round the robot at hand and all else in tiles: for places larger than a house.
-    The capacity then follows from range and voxel size."""
+    """Hold what lies round the robot at hand and all else in tiles: for places larger than a house,
+    and the policies r3 and r3-pano. The capacity then follows from range and voxel size."""
 
     max_range: float = 5.0
     """Range of the depth sensor [m]."""

@@ -25,7 +25,14 @@ from r3jax.errors import InputError
 from r3jax.geometry.cameras import Camera
 from r3jax.geometry.voxels import check_near_origin
 from r3jax.mapping.config import MappingConfig
-from r3jax.mapping.occupancy import COSTMAP, KEEP_OUT, REFUSED, OccupancyGrid, squared_distance
+from r3jax.mapping.occupancy import (
+    COSTMAP,
+    KEEP_OUT,
+    MAX_CELLS,
+    REFUSED,
+    OccupancyGrid,
+    squared_distance,
+)
 from r3jax.mapping.state import MapState
 from r3jax.mapping.tiles import (
     ACROSS,
@@ -38,6 +45,7 @@ from r3jax.mapping.tiles import (
     lattice_for,
     middle_for,
     page,
+    unpacked_layer,
     with_arrays,
 )
 from r3jax.planning.candidates import candidates_along
@@ -135,6 +143,65 @@ class Far:
         """Adds cells at hand, [X, Y, Z] bool, to the trails."""
         new = np.argwhere(trail & ~self.trail) + self.first_cell
         return replace(self, trails=np.concatenate([self.trails, new])) if len(new) else self
+
+    def is_at_hand(self, position: np.ndarray) -> bool:
+        """Returns True if all that may be seen from a position [3] [m] is at hand."""
+        return bool(_at_hand(self, position[None], self.tiles.middle)[0])
+
+    def whole_grid(self, grid: OccupancyGrid) -> OccupancyGrid:
+        """Joins the cells at hand and those of all tiles, without marks.
+
+        It covers the box, or along axes without end all tiles of which anything is known.
+
+        Args:
+            grid: the cells at hand.
+
+        Raises:
+            ValueError: more cells than a grid may have.
+        """
+        lattice = self.tiles.lattice
+        edge = np.array(lattice.cells)
+        corners = np.array([*self.tiles.cells, self.first_cell // edge]) * edge
+        block = self.first_cell + np.array(lattice.shape)
+        known = np.array([corners.min(axis=0), np.maximum(corners.max(axis=0) + edge, block)])
+        box = self.box_cells
+        first, last = np.where(np.isfinite(box), box, known).astype(np.int64)
+        num = float(np.prod((last - first).astype(float)))
+        if num > MAX_CELLS:
+            raise InputError(
+                f"the place has {num:.2g} cells, more than the {MAX_CELLS:.0e} of one grid: larger "
+                "cells (cell_size) are fewer"
+            )
+        log_odds = np.zeros(last - first, np.float32)
+
+        def put(values: np.ndarray, at: np.ndarray) -> None:
+            low = np.maximum(at, first)
+            high = np.minimum(at + values.shape, last)
+            if np.all(low < high):
+                to, of = (tuple(map(slice, low - x, high - x)) for x in (first, at))
+                log_odds[to] = values[of]
+
+        for tile, layers in self.tiles.cells.items():
+            if "log_odds" in layers:
+                put(unpacked_layer(layers["log_odds"], lattice.cells), np.array(tile) * edge)
+        put(np.asarray(grid.log_odds), self.first_cell)
+        return OccupancyGrid(
+            log_odds=jnp.asarray(log_odds),
+            origin=jnp.asarray(np.array(lattice.origin) + first * lattice.cell_size, jnp.float32),
+            cell_size=grid.cell_size,
+        )
+
+    @property
+    def box_cells(self) -> np.ndarray:
+        """First cell of the box, and the first one beyond it, counted from tile (0, 0, 0), [2, 3].
+
+        A cell more on every side, as in a grid of the box; infinite where it has no end.
+        """
+        lattice = self.tiles.lattice
+        box = (self.box - np.array(lattice.origin)) / lattice.cell_size
+        # The cells whose centers lie within; the tolerance keeps faces on cells' borders exact.
+        ends = np.array([np.floor(box[0] - 0.5 + 1e-6), np.ceil(box[1] + 0.5 - 1e-6)])
+        return np.where(np.array(lattice.num) > 1, ends, [np.zeros(3), np.array(lattice.cells)])
 
     def grid(self, log_odds: np.ndarray) -> OccupancyGrid:
         """Makes the grid at hand of its cells: with the limits, zones and marks that lie in it."""
@@ -237,6 +304,17 @@ def moved_to(known: Known, policy: GreedyPolicy, position: np.ndarray) -> Known:
     far = replace(far, tiles=tiles, views=views)
     memory = replace(memory, looks=layers["looks"], trail=far.trail)
     return after, far.grid(layers["log_odds"]), memory, far
+
+
+def known_round(
+    map_state: MapState, grid: OccupancyGrid, far: Far, position: np.ndarray
+) -> tuple[MapState, OccupancyGrid]:
+    """Returns the rows and the cells of the block round any position [3] [m]."""
+    lattice = far.tiles.lattice
+    layers = {name: np.zeros(lattice.shape, kind) for name, kind in _KINDS.items()}
+    layers["log_odds"] = np.asarray(grid.log_odds)
+    state, layers, tiles = page(map_state, layers, far.tiles, position)
+    return state, replace(far, tiles=tiles).grid(layers["log_odds"])
 
 
 def _at_hand(far: Far, positions: np.ndarray, middle: Tile) -> np.ndarray:

@@ -95,6 +95,15 @@ class Planner(eqx.Module):
         """All voxels in one table: those at hand, and those in tiles."""
         return self.map_state if self.far is None else whole_map(self.map_state, self.far.tiles)
 
+    @property
+    def whole_grid(self) -> OccupancyGrid:
+        """All cells in one grid: those at hand, and those in tiles.
+
+        Raises:
+            ValueError: more cells than a grid may have.
+        """
+        return self.grid if self.far is None else self.far.whole_grid(self.grid)
+
 
 a_planner = one(Planner, "r3jax.start makes one")
 
@@ -157,10 +166,14 @@ def start(
         folder = open_tile_folder(tile_folder, tile_memory)
         far = replace(far, tiles=replace(far.tiles, folder=folder))
     config = replace(config, tiles=True, capacity=far.tiles.capacity)
-    grid = mark_starts(far.grid(np.zeros(far.tiles.lattice.shape, np.float32)), starts, config)
+    grid = far.grid(np.zeros(far.tiles.lattice.shape, np.float32))
     policy_state = policy.init(camera, grid, key=key)
     check_policy(policy, policy_state)
-    return Planner(first_map(config), grid, policy_state, policy, config, far=far)
+    planner = Planner(first_map(config), grid, policy_state, policy, config, far=far)
+    for pose in [*starts, *starts[:1]]:  # the block ends where it begins, round the first one
+        planner = at_hand(planner, np.asarray(pose, np.float64)[:3, 3])
+        planner = replace(planner, grid=mark_starts(planner.grid, [pose], config))
+    return planner
 
 
 def at_hand(planner: Planner, position: np.ndarray) -> Planner:
@@ -426,12 +439,14 @@ def decide_ahead(
     """
     if not isinstance(planner.policy, PlansAhead):
         return None, planner, PlanInfo(DecisionOutcome.NO_CANDIDATE)
-    planner = at_hand(planner, T_next[:3, 3])
+    there = at_hand(planner, T_next[:3, 3])
     pose = jnp.asarray(T_next, dtype=jnp.float32)
-    map_state, grid = imagine_view(planner.map_state, planner.grid, camera, pose, scoring)
+    map_state, grid = imagine_view(there.map_state, there.grid, camera, pose, scoring)
     decision, state, info = planner.policy.decide(
-        planner.policy_state, map_state, grid, np.asarray(T_next, np.float64), key=key
+        there.policy_state, map_state, grid, np.asarray(T_next, np.float64), key=key
     )
+    if planner.far is not None:  # its policy keeps nothing, and the camera is not there yet
+        return decision, planner, info
     if isinstance(planner.policy_state, PlannerState):
         state = replace(planner.policy_state, memory=state.memory)
     return decision, replace(planner, policy_state=state), info

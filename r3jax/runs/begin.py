@@ -12,6 +12,7 @@ from r3jax.errors import InputError
 from r3jax.exploration.guard import first_pose
 from r3jax.exploration.taken_views import StepRow, unit_of
 from r3jax.mapping.state import MapState
+from r3jax.planning.planner import start
 from r3jax.planning.robot.motion import motion_of
 from r3jax.runs.header import RunError, RunHeader, package_versions, policy_fields
 from r3jax.runs.reader import Run, read_run
@@ -24,7 +25,7 @@ from r3jax.runs.settings import (
     open_run_scene,
     settings_of_run,
 )
-from r3jax.runs.stored_states import map_tables
+from r3jax.runs.stored_states import planner_tables
 from r3jax.runs.writer import RunWriter
 from r3jax.simulators.base import Simulator
 
@@ -56,7 +57,10 @@ def begin_run(
     """
     simulator = scene.open()
     # Refused before there is a folder.
-    first_pose(simulator, motion_of(settings.policy), settings.config.cell_size)
+    pose = first_pose(simulator, motion_of(settings.policy), settings.config)
+    if settings.config.tiles:  # not for every policy
+        start(simulator.camera, simulator.bounds, settings.policy, starts=[pose],
+              config=settings.config)  # fmt: skip
     header = new_header(settings, scene, simulator)
     recorder = RunWriter(path, header, overwrite=overwrite)
     return Expedition(settings, simulator, recorder, scene.seed)
@@ -210,7 +214,7 @@ def merge_runs(
                 f"its camera is not that of {runs[0].path}, and a run has one: {run.header.camera} "
                 f"instead of {runs[0].header.camera}",
             )
-    map_state, grid = rebuild(runs, on_frame=on_frame)
+    planner = rebuild(runs, on_frame=on_frame)
     with RunWriter(out, _header(runs), overwrite=overwrite) as writer:
         last: StepRow | None = None
         for run in runs:
@@ -218,9 +222,9 @@ def merge_runs(
             for row in run.rows:
                 last = _behind(row, before)
                 writer.adopt(last, run, row.step)
-        writer.checkpoint(writer.views - 1, map_tables(map_state, grid), wait=True)
+        writer.checkpoint(writer.views - 1, planner_tables(planner), wait=True)
         writer.finish("merged", f"the views of {' and '.join(str(run.path) for run in runs)}")
-    return map_state
+    return planner.whole_map
 
 
 def _check_apart(runs: list[Run]) -> None:

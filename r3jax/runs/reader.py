@@ -1,7 +1,7 @@
 """Reads a run folder: settings and rows immediately, images on demand."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from r3jax.exploration.state import LoopState
 from r3jax.exploration.taken_views import StepRow, content_hash, from_integers
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
+from r3jax.mapping.config import MappingConfig
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.runs.header import RunError, RunHeader, read_header
@@ -95,8 +96,17 @@ class Run:
         return (self.frame(row.step) for row in self.rows)
 
     def checkpoint(self) -> tuple[int, MapState, OccupancyGrid]:
-        """Reads the newest stored map and grid, and the view after which they were stored."""
-        return read_checkpoint(self.path / "checkpoints")
+        """Reads the newest stored map and grid, and the view after which they were stored.
+
+        Of a run with tiles the whole map, and the whole grid.
+        """
+        config = self.header.config
+        known = {field.name for field in fields(MappingConfig)}
+        try:
+            mapping = MappingConfig(**{k: v for k, v in config.items() if k in known})
+        except (TypeError, ValueError) as error:
+            raise RunError(self.path / "run.json", f"a setting of the loop: {error}") from None
+        return read_checkpoint(self.path / "checkpoints", mapping, self.camera)
 
     def checkpoint_steps(self) -> list[int]:
         """Lists the views with a checkpoint, oldest first."""

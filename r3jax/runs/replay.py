@@ -9,7 +9,7 @@ Shape symbols: m voxels that a view sees; k cells.
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -17,13 +17,18 @@ import numpy as np
 
 from r3jax.exploration.captures import scoring_on_the_way
 from r3jax.mapping.occupancy import OccupancyGrid, centers_on_host
-from r3jax.mapping.state import MapState
-from r3jax.planning.decide import explain_path, initial_state
-from r3jax.planning.planner import add_frame, first_grid, first_map
+from r3jax.mapping.state import MapState, empty_map
+from r3jax.mapping.tile_files import Voxels
+from r3jax.mapping.tiles import page
+from r3jax.planning.decide import PlannerState, explain_path, initial_state
+from r3jax.planning.far import Far
+from r3jax.planning.planner import Planner, start, take_in
+from r3jax.planning.registry import make_policy
 from r3jax.planning.turning import count_look
 from r3jax.runs.header import RunError
 from r3jax.runs.reader import Run, read_run
 from r3jax.runs.settings import config_of, planner_config_of
+from r3jax.runs.stored_states import known_of
 from r3jax.scoring.explain import Explanation
 
 
@@ -65,7 +70,7 @@ class Difference:
 
 def rebuild(
     runs: Sequence[Run], views: int | None = None, on_frame: Callable[[], None] = lambda: None
-) -> tuple[MapState, OccupancyGrid]:
+) -> Planner:
     """Rebuilds the map and the grid from the frames of all runs, one run after the other.
 
     Args:
@@ -79,7 +84,7 @@ def rebuild(
     return _last(runs, ((run, row.step) for run in runs for row in run.rows[:views]), on_frame)
 
 
-def rebuild_team(runs: Sequence[Run]) -> tuple[MapState, OccupancyGrid]:
+def rebuild_team(runs: Sequence[Run]) -> Planner:
     """Rebuilds a team's map and grid after its last meeting, all frames in the clock's order.
 
     Raises:
@@ -90,45 +95,36 @@ def rebuild_team(runs: Sequence[Run]) -> tuple[MapState, OccupancyGrid]:
     return _last(runs, ((runs[number], step) for _, number, step in steps))
 
 
-def states_of(run: Run) -> Iterator[tuple[MapState, OccupancyGrid]]:
+def states_of(run: Run) -> Iterator[Planner]:
     """Rebuilds the map and the grid after each view of a run, in order, lazily.
 
     Raises:
         RunError: no view, invalid settings, or a frame that is missing or broken.
     """
-    return _states([run], ((run, row.step) for row in run.rows))
+    return _states(first_planner([run]), ((run, row.step) for row in run.rows))
 
 
 def _last(
     runs: Sequence[Run],
     frames: Iterable[tuple[Run, int]],
     on_frame: Callable[[], None] = lambda: None,
-) -> tuple[MapState, OccupancyGrid]:
+) -> Planner:
     """Rebuilds the map and the grid after all frames, each given by its run and number."""
     # Before the first frame: mapping takes minutes, and mismatches are reported immediately.
     for run in runs[1:]:
         check_alike(runs[0], run)
-    state = _first(runs)
-    for after in _states(runs, frames):
-        state = after
+    planner = first_planner(runs)
+    for after in _states(planner, frames):
+        planner = after
         on_frame()
-    return state
+    return planner
 
 
-def _states(
-    runs: Sequence[Run], frames: Iterable[tuple[Run, int]]
-) -> Iterator[tuple[MapState, OccupancyGrid]]:
-    """Yields the map and the grid of several runs after each frame."""
-    config, state = config_of(runs[0]), _first(runs)
+def _states(planner: Planner, frames: Iterable[tuple[Run, int]]) -> Iterator[Planner]:
+    """Yields the map and the grid after each frame."""
     for run, step in frames:
-        state = add_frame(*state, run.frame(step), config)
-        yield state
-
-
-def _first(runs: Sequence[Run]) -> tuple[MapState, OccupancyGrid]:
-    """Makes the map and the grid before the first view of runs in one scene."""
-    config = config_of(runs[0])
-    return first_map(config), grid_before(runs)
+        planner = take_in(planner, run.frame(step))
+        yield planner
 
 
 def team_of(run: Run) -> list[Run]:
@@ -152,8 +148,10 @@ def team_of(run: Run) -> list[Run]:
     return team
 
 
-def grid_before(runs: Sequence[Run]) -> OccupancyGrid:
-    """Makes the grid before the first view of runs in one scene.
+def first_planner(runs: Sequence[Run]) -> Planner:
+    """Makes the map and the grid before the first view of runs in one scene.
+
+    Of whatever policy they are: the planner maps and decides nothing.
 
     Raises:
         RunError: a run without a view, or invalid settings.
@@ -161,10 +159,29 @@ def grid_before(runs: Sequence[Run]) -> OccupancyGrid:
     bounds = np.asarray(runs[0].header.bounds, dtype=np.float64)
     # All starts before any frame: the space around each start is free, but in no image.
     starts = [pose for run in runs for pose in starts_of(run)]
+    config = config_of(runs[0])
+    policy = make_policy("r3", scoring=scoring_on_the_way(config))
     try:
-        return first_grid(bounds, starts, config_of(runs[0]))
+        return start(runs[0].camera, bounds, policy, starts=starts, config=config)
     except ValueError as error:
         raise RunError(runs[0].path / "run.json", str(error)) from None
+
+
+def stored_planner(run: Run) -> tuple[int, Planner]:
+    """Reads the newest stored map and grid, and the view after which they were stored.
+
+    Raises:
+        RunError: there is none, or it cannot be read.
+    """
+    steps = run.checkpoint_steps()
+    if not steps:
+        raise RunError(run.path / "checkpoints", "the run has no checkpoint")
+    tables = run.load_checkpoint(steps[-1])
+    try:
+        return steps[-1], known_of(tables, first_planner([run]))
+    except ValueError as error:
+        path = run.path / "checkpoints" / f"{steps[-1]:06d}"
+        raise RunError(path, f"the checkpoint cannot be read ({error})") from None
 
 
 def check_decided_alone(run: Run) -> None:
@@ -208,9 +225,13 @@ def differences(
     team = [run]
     if run.header.is_of_team:
         team = team_of(run)
-        map_state, grid = rebuild_team(team)
+        planner = rebuild_team(team)
     else:
-        map_state, grid = rebuild([run], step + 1, on_frame)
+        planner = rebuild([run], step + 1, on_frame)
+    map_state, grid = planner.whole_map, planner.whole_grid
+    if planner.far is not None:
+        # Where a row lies in a table depends on when its tile came to hand.
+        stored_map, map_state = sorted_rows(stored_map), sorted_rows(map_state)
     found: list[Difference | None] = []
     for table, stored, rebuilt in (("map", stored_map, map_state), ("grid", stored_grid, grid)):
         for name, array in vars(stored).items():
@@ -218,6 +239,13 @@ def differences(
                 found.append(_compare(f"{table}.{name}", array, getattr(rebuilt, name)))
     views = step + 1 if team == [run] else sum(len(member.rows) for member in team)
     return views, [difference for difference in found if difference is not None]
+
+
+def sorted_rows(state: MapState) -> MapState:
+    """Returns the rows of voxels in the order of their keys; nothing can be looked up in them."""
+    present = np.flatnonzero(np.asarray(state.present))
+    order = present[np.lexsort(np.asarray(state.key)[:, present])]
+    return state.take(jnp.asarray(order), jnp.ones(len(order), bool))
 
 
 def _compare(name: str, stored: jax.Array, rebuilt: jax.Array) -> Difference | None:
@@ -281,9 +309,7 @@ def reason_of(explanation: Explanation, grid: OccupancyGrid) -> Reason:
     )
 
 
-def explain_run(
-    run: Run, states: Iterable[tuple[MapState, OccupancyGrid]] | None = None
-) -> Iterator[Reason | None]:
+def explain_run(run: Run, states: Iterable[Planner] | None = None) -> Iterator[Reason | None]:
     """Explains why each view of a run was chosen, in order; takes as long as mapping.
 
     Args:
@@ -291,8 +317,9 @@ def explain_run(
         states: the map and the grid after each view, in order; by default rebuilt from the frames.
 
     Yields:
-        The reason of each view; None for the first, which was not chosen. If frames were captured
-        while moving, it belongs to the first row of the path, like the choice.
+        The reason of each view; None for the first, which was not chosen, and with tiles for a way
+        back to what is not at hand. If frames were captured while moving, it belongs to the first
+        row of the path, like the choice.
 
     Raises:
         RunError: the run was merged, or is a fork of a merged run or a team's; a setting is
@@ -308,21 +335,59 @@ def explain_run(
         )
     config, scoring = planner_config_of(run), scoring_on_the_way(config_of(run))
     after_views = iter(states_of(run) if states is None else states)
-    memory, before = None, None
+    memory: _Memory | None = None
+    before: tuple[np.ndarray, Planner] | None = None
     for row in run.rows:
-        if row.choice is None or before is None:
+        if row.choice is None or before is None or memory is None:
             yield None
         else:
-            pose, (map_state, grid) = before
-            memory = memory or initial_state(run.camera, grid, motion=config.motion)
+            pose, planner = before
             choice = row.choice
             # The memory is passed from view to view: cells that were given up do not count later.
-            memory, explanation = explain_path(
-                memory, map_state, grid, pose, choice.pose, choice.waypoints, config
-            )
-            yield reason_of(explanation, grid)
+            state, explanation = explain_path(
+                memory.state, planner.map_state, planner.grid, pose, choice.pose,
+                choice.waypoints, config,
+            )  # fmt: skip
+            if planner.far is None or planner.far.is_at_hand(choice.pose[:3, 3]):
+                memory = replace(memory, state=state)
+                yield reason_of(explanation, planner.grid)
+            else:
+                memory = replace(memory, state=replace(state, trail=memory.state.trail))
+                yield None
         if row is not run.rows[-1]:  # no decision was made on the last map
-            before = np.asarray(row.pose, dtype=np.float64), next(after_views)
+            planner = next(after_views)
+            before = np.asarray(row.pose, dtype=np.float64), planner
+            if memory is None:
+                memory = _Memory(initial_state(run.camera, planner.grid, motion=config.motion))
+            memory = memory.beside(planner)
             if row.captured:
-                camera, pose = run.camera, jnp.asarray(row.pose)
-                memory = count_look(memory, *before[1], camera, pose, scoring)
+                known, view = (planner.map_state, planner.grid), (run.camera, jnp.asarray(row.pose))
+                state = count_look(memory.state, *known, *view, scoring)
+                memory = replace(memory, state=state)
+
+
+@dataclass(frozen=True)
+class _Memory:
+    """A policy's memory along a run."""
+
+    state: PlannerState
+
+    far: Far | None = None
+    """With tiles: its cells that are not at hand."""
+
+    def beside(self, planner: Planner) -> "_Memory":
+        """Returns the memory of the cells that a planner has at hand."""
+        if planner.far is None:
+            return self
+        tiles = planner.far.tiles
+        if self.far is None:
+            empty = replace(tiles, voxels=Voxels(), cells={})
+            trails = planner.far.trails[:0]
+            return replace(self, far=replace(planner.far, tiles=empty, trails=trails))
+        lattice, far = tiles.lattice, self.far.with_trail(self.state.trail)
+        size = np.array(lattice.shape) * lattice.cell_size
+        center = lattice.corner(tiles.middle) + 0.5 * size
+        layers = {"looks": self.state.looks}
+        _, layers, kept = page(empty_map(2), layers, far.tiles, center)
+        far = replace(far, tiles=kept)
+        return _Memory(replace(self.state, looks=layers["looks"], trail=far.trail), far)

@@ -1,6 +1,7 @@
 """The loop's state on disk after every view, saved with Orbax in the background.
 
-A checkpoint holds tables of named arrays: `map`, `grid`, `policy` and `loop`. It is a cache: frames
+A checkpoint holds tables of named arrays: `map`, `grid`, `policy` and `loop`, and `far` in a run
+with tiles, whose `map` and `grid` are those at hand. It is a cache: frames
 and rows suffice to rebuild it. Checkpoints of earlier versions contain only `map` and `grid`.
 """
 
@@ -27,8 +28,13 @@ from r3jax.checkpoints import (
 from r3jax.errors import InputError
 from r3jax.exploration.state import LoopState
 from r3jax.exploration.taken_views import StepRow
+from r3jax.geometry.cameras import Camera
+from r3jax.mapping.config import MappingConfig
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
+from r3jax.mapping.tiles import whole_map
+from r3jax.planning.far import far_arrays, far_of
+from r3jax.planning.planner import Planner
 from r3jax.runs.header import RunError
 from r3jax.validation.errors import ForeignFileError
 
@@ -162,8 +168,15 @@ def from_storable(table: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return arrays
 
 
-def read_checkpoint(folder: Path) -> tuple[int, MapState, OccupancyGrid]:
+def read_checkpoint(
+    folder: Path, config: MappingConfig | None = None, camera: Camera | None = None
+) -> tuple[int, MapState, OccupancyGrid]:
     """Reads the newest stored map and grid, and the view after which they were stored.
+
+    Args:
+        folder: of the checkpoints.
+        config: of the run; with its camera needed to join the tiles of a run that has some.
+        camera: of the run.
 
     Raises:
         RunError: there is none, or it cannot be read.
@@ -176,8 +189,12 @@ def read_checkpoint(folder: Path) -> tuple[int, MapState, OccupancyGrid]:
         arrays: dict[str, Any] = {name: jnp.asarray(x) for name, x in tables["map"].items()}
         # It is static in MapState, not an array.
         num_bins = int(arrays.pop("num_bins"))
-        grid = {name: jnp.asarray(x) for name, x in tables["grid"].items()}
-        return steps[-1], MapState(**arrays, num_bins=num_bins), OccupancyGrid(**grid)
+        map_state = MapState(**arrays, num_bins=num_bins)
+        grid = OccupancyGrid(**{name: jnp.asarray(x) for name, x in tables["grid"].items()})
+        if "far" in tables and config is not None and camera is not None:
+            far = far_of(tables["far"], config, camera)
+            map_state, grid = whole_map(map_state, far.tiles), far.whole_grid(grid)
+        return steps[-1], map_state, grid
     except (ValueError, KeyError, TypeError) as error:
         path = folder / f"{steps[-1]:06d}"
         raise RunError(path, f"the checkpoint cannot be read ({error})") from None
@@ -189,10 +206,16 @@ def map_tables(map_state: MapState, grid: OccupancyGrid) -> dict[str, dict[str, 
     return {"map": named_arrays(map_state) | num_bins, "grid": named_arrays(grid)}
 
 
+def planner_tables(planner: Planner) -> dict[str, dict[str, np.ndarray]]:
+    """Returns the tables `map`, `grid`, `policy`, and with tiles `far`."""
+    tables = map_tables(planner.map_state, planner.grid)
+    tables["policy"] = named_arrays(planner.policy_state)
+    return tables if planner.far is None else tables | {"far": far_arrays(planner.far)}
+
+
 def state_tables(state: LoopState) -> dict[str, dict[str, np.ndarray]]:
     """Returns the tables of a checkpoint of the state."""
-    tables = map_tables(state.map_state, state.grid)
-    tables["policy"] = named_arrays(state.policy_state)
+    tables = planner_tables(state.planner)
     return tables | {"loop": {name: np.asarray(getattr(state, name)) for name in _LOOP}}
 
 
@@ -235,23 +258,50 @@ def state_of(tables: Tables, like: LoopState) -> LoopState:
     Raises:
         ValueError: a table or an array is missing or of another type.
     """
-    missing = sorted({"map", "grid", "loop"} - set(tables))
-    if missing:
-        raise InputError(f"the checkpoint is missing {', '.join(missing)}")
+    _check_tables(tables, "map", "grid", "loop")
+    # With `fill`, so that totals are plain numbers again.
+    rest = {name: getattr(like, name) for name in _LOOP}
+    planner = replace(
+        known_of(tables, like.planner),
+        policy_state=memory_of(like.policy_state, tables),
+    )
+    return LoopState(planner=planner, **fill(rest, _LATER | dict(tables["loop"])))
+
+
+def known_of(tables: Tables, like: Planner) -> Planner:
+    """Restores all but a planner's memory from the tables of `planner_tables`.
+
+    Args:
+        tables: of a checkpoint.
+        like: a planner of the same run.
+
+    Raises:
+        ValueError: a table or an array is missing or of another type.
+    """
+    _check_tables(tables, "map", "grid", *(() if like.far is None else ("far",)))
     arrays = dict(tables["map"])
     # Not an array of the map, so `fill` would not notice: with other bins the visited bits mean
     # other directions.
     if int(arrays.pop("num_bins", -1)) != like.map_state.num_bins:
         raise InputError("the checkpoint's map has other direction bins than the run")
-    # With `fill`, so that totals are plain numbers again.
-    rest = {name: getattr(like, name) for name in _LOOP}
-    planner = replace(
-        like.planner,
+    far = like.far
+    if far is not None:
+        try:
+            far = far_of(tables["far"], like.config, like.policy_state.camera)
+        except KeyError as error:
+            raise InputError(f"the checkpoint's tiles are missing {error}") from None
+    return replace(
+        like,
         map_state=fill(like.map_state, arrays),
         grid=fill(like.grid, tables["grid"]),
-        policy_state=memory_of(like.policy_state, tables),
+        far=far,
     )
-    return LoopState(planner=planner, **fill(rest, _LATER | dict(tables["loop"])))
+
+
+def _check_tables(tables: Tables, *names: str) -> None:
+    missing = sorted(set(names) - set(tables))
+    if missing:
+        raise InputError(f"the checkpoint is missing {', '.join(missing)}")
 
 
 def memory_of(like: Any, tables: Tables) -> Any:

@@ -50,6 +50,9 @@ _MAX_IMAGE_BYTES = 256 << 20
 # saves another tenth and takes 60 ms.
 _PNG_LEVEL = 2
 
+_TILES_EVERY = 20
+"""Views between two checkpoints of a run with tiles, at least."""
+
 _ROOM = ".room"
 _ROOM_BYTES = 64 << 10
 """Space reserved while a run is written, so that a full disk has space for the final row."""
@@ -273,7 +276,10 @@ class RunWriter:
         begin = time.perf_counter()
         # The view first: when resuming, a checkpoint without a row is ignored.
         self.add(view.row, view.frame)
-        if not view.row.captured and state.chosen % config.checkpoint_every == 0:
+        every = config.checkpoint_every
+        if config.tiles:  # all tiles are written again: time that the next views would miss
+            every = max(every, _TILES_EVERY)
+        if not view.row.captured and state.chosen % every == 0:
             self.checkpoint(view.row.step, state_tables(state))
         seconds = time.perf_counter() - begin
         self.add_timings(view.row.step, view.stages | {"record": seconds})

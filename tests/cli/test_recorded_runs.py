@@ -178,12 +178,12 @@ def test_a_merged_run_has_seen_what_both_have_seen(runs, tmp_path):
     assert len(json.loads((out / "transforms.json").read_text())["frames"]) == VIEWS + 3
     assert main(["replay", str(out)]) == 0
     _, merged, grid = run.checkpoint()
-    maps = [rebuild([r])[0] for r in (first, second)]
+    maps = [rebuild([r]).map_state for r in (first, second)]
     joined = merge(grow(maps[0], merged.capacity), maps[1])
     assert int(merged.num_occupied) == int(joined.num_occupied)
     assert float(merged.count.sum()) == float(joined.count.sum())
     known = lambda grid: int((grid.free | grid.occupied).sum())
-    assert known(grid) >= max(known(rebuild([r])[1]) for r in (first, second))
+    assert known(grid) >= max(known(rebuild([r]).grid) for r in (first, second))
 
 
 def test_a_run_is_not_merged_with_itself(runs, tmp_path, capsys):
@@ -224,7 +224,7 @@ def test_a_merged_run_merges_again(runs, tmp_path):
     assert main(["replay", str(tmp_path / "three")]) == 0
     run = read_run(tmp_path / "three")
     assert run.header.parent["merged_views"] == [3, 3, VIEWS]
-    cells = rebuild([read_run(path) for path in paths])[1]
+    cells = rebuild([read_run(path) for path in paths]).grid
     np.testing.assert_array_equal(run.checkpoint()[2].log_odds, cells.log_odds)
 
 

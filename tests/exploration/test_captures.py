@@ -304,7 +304,7 @@ def test_no_frame_on_the_way_leaves_free_space_or_what_its_motion_allows(tmp_pat
     config = replace(PANORAMA, capture_every=0.15)
     record(tmp_path / "run", policy, config, "views:5")
     run = read_run(tmp_path / "run")
-    grids = [grid for _, grid in states_of(run)]
+    grids = [planner.grid for planner in states_of(run)]
     assert sum(row.captured for row in run.rows) >= 3
     start = run.rows[0].pose[2, 3]
     low, high = motion.heights_from(float(start))

@@ -79,7 +79,7 @@ def test_a_reason_holds_the_voxels_that_lack_something(run, states):
     for step, reason in enumerate(explain_run(run, states)):
         if reason is None:
             continue
-        map_state, grid = states[step - 1]
+        map_state, grid = states[step - 1].map_state, states[step - 1].grid
         assert reason.shares.shape == (3, len(reason.rows))
         assert np.asarray(map_state.occupied)[reason.rows].all()
         np.testing.assert_allclose(reason.shares.sum(axis=1), reason.totals[1:], rtol=1e-4)
@@ -92,9 +92,9 @@ def test_a_reason_holds_the_voxels_that_lack_something(run, states):
 
 
 def test_states_are_the_rebuilt_ones_and_are_made_when_asked_for(run, states):
-    map_state, grid = rebuild([run], 3)
-    np.testing.assert_array_equal(states[2][0].visited, map_state.visited)
-    np.testing.assert_array_equal(states[2][1].log_odds, grid.log_odds)
+    planner = rebuild([run], 3)
+    np.testing.assert_array_equal(states[2].map_state.visited, planner.map_state.visited)
+    np.testing.assert_array_equal(states[2].grid.log_odds, planner.grid.log_odds)
     asked = []
 
     def watched():

@@ -13,7 +13,7 @@ Shape symbols: V views; X Y Z cells.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import jax
@@ -30,6 +30,7 @@ from r3jax.exploration.state import LoopState
 from r3jax.geometry.cameras import LOOKS, Camera, poses_at
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
+from r3jax.planning.far import known_round
 from r3jax.planning.planner import Planner
 from r3jax.planning.robot.travel import safe_cells
 from r3jax.runs.reader import Run
@@ -135,17 +136,82 @@ def forecast_map(
             benchmark's small size (`python -m experiments.forecast`).
     """
     poses = free_space_views(grid, NUM_VIEWS)
-    known = calibration or default_calibration()
-    if len(poses) == 0:
-        return Forecast(np.zeros(0), known)
     config = ScoringConfig(max_range=max_range)
+    shown = [_shown(state, grid, camera, poses, config)] if len(poses) else []
+    return _forecast_of(shown, calibration or default_calibration())
+
+
+_MOST_JOINED = 4_000_000
+"""Voxels in tiles up to which a forecast joins them in one table: block by block takes longer."""
+
+
+def forecast_planner(
+    planner: Planner,
+    camera: Camera,
+    *,
+    max_range: float = 5.0,
+    calibration: Calibration | None = None,
+) -> Forecast:
+    """Predicts the PSNR as `forecast_map` does, also of a map in tiles of any size.
+
+    Args:
+        planner: holds the map and the grid.
+        camera: as in `forecast_map`; so are the others.
+        max_range: [m].
+        calibration: what to believe.
+
+    Raises:
+        ValueError: tiles of more cells than a grid may have.
+    """
+    far, grid = planner.far, planner.whole_grid
+    num = 0 if far is None else far.tiles.num_voxels + int(planner.map_state.num_present)
+    if far is None or num <= _MOST_JOINED:
+        return forecast_map(
+            planner.whole_map, grid, camera, max_range=max_range, calibration=calibration
+        )
+    poses = free_space_views(grid, NUM_VIEWS)
+    config = ScoringConfig(max_range=max_range)
+    tile = far.tiles.lattice.tiles_of(poses[:, :3, 3].T.astype(np.float64))
+    order, cuts = np.lexsort(tile), np.zeros(0, int)
+    if len(poses):
+        cuts = np.flatnonzero(np.any(np.diff(tile[:, order], axis=1) != 0, axis=0)) + 1
+    shown: list[tuple[np.ndarray, np.ndarray]] = []
+    for which in np.split(order, cuts):
+        for some in np.array_split(which, -(-len(which) // _AT_ONCE)) if len(which) else []:
+            state, near = known_round(planner.map_state, planner.grid, far, poses[some[0], :3, 3])
+            shown.append(_shown(state, near, camera, poses[some], config, _AT_ONCE))
+    return _forecast_of(shown, calibration or default_calibration())
+
+
+_AT_ONCE = 8
+"""Views of one block that are scored together."""
+
+
+def _shown(
+    state: MapState,
+    grid: OccupancyGrid,
+    camera: Camera,
+    poses: np.ndarray,
+    config: ScoringConfig,
+    num: int = NUM_VIEWS,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Computes coverage and renderability of the views that do not look into the void."""
     # Padded to one length, so that one compilation serves the whole run.
-    padded = jnp.asarray(poses[np.arange(NUM_VIEWS) % len(poses)])
+    padded = jnp.asarray(poses[np.arange(num) % len(poses)])
     coverage, renderability = view_features(state, camera, padded, config)
     unexplored = np.asarray(score_views(state, grid, camera, padded, config).exploration)
     shows = ((coverage >= _LEAST_SHOWN) | (unexplored > 0.0))[: len(poses)]
-    parts = coverage[: len(poses)][shows], renderability[: len(poses)][shows]
-    return Forecast(np.sort(known.model.mixture(*parts), axis=None), known)
+    return coverage[: len(poses)][shows], renderability[: len(poses)][shows]
+
+
+def _forecast_of(
+    shown: Sequence[tuple[np.ndarray, np.ndarray]], calibration: Calibration
+) -> Forecast:
+    """Mixes the forecasts of views."""
+    if not shown:
+        return Forecast(np.zeros(0), calibration)
+    parts = (np.concatenate(part) for part in zip(*shown, strict=True))
+    return Forecast(np.sort(calibration.model.mixture(*parts), axis=None), calibration)
 
 
 def view_features(
@@ -188,7 +254,7 @@ def stopping_rule(
     goal = parse_goal(config.until)
 
     def is_enough(state: LoopState) -> str | None:
-        forecast = forecast_map(state.map_state, state.grid, camera, max_range=config.max_range)
+        forecast = forecast_planner(state.planner, camera, max_range=config.max_range)
         if not goal.reached(forecast):
             return None
         low, high = forecast.interval(goal.statistic)
@@ -214,15 +280,14 @@ def is_done(planner: Planner, goal: str, camera: Camera | None = None) -> bool:
 
     Raises:
         ValueError: a goal that is not understood; or a policy that does not say which camera it
-            plans for; or one of tiles, of which the forecast would read what is at hand only.
+            plans for; or tiles of more cells than a grid may have.
     """
-    if planner.far is not None:
-        raise InputError("a forecast reads a whole map, and this planner holds it in tiles")
     lens = getattr(planner.policy_state, "camera", None) if camera is None else camera
     if not isinstance(lens, Camera):
         raise InputError(f"the policy {planner.policy.name!r} keeps no camera: give camera=")
-    known = planner.map_state, planner.grid
-    return parse_goal(goal).reached(forecast_map(*known, lens, max_range=planner.config.max_range))
+    return parse_goal(goal).reached(
+        forecast_planner(planner, lens, max_range=planner.config.max_range)
+    )
 
 
 _LEAST_GAIN = 0.1
@@ -255,29 +320,26 @@ class Outlook:
         """Counts the views up to each frame of the run, that frame included."""
         return np.cumsum([not row.captured for row in self.run.rows])
 
-    def watch(
-        self, states: Iterable[tuple[MapState, OccupancyGrid]]
-    ) -> Iterator[tuple[MapState, OccupancyGrid]]:
+    def watch(self, states: Iterable[Planner]) -> Iterator[Planner]:
         """Passes on the map and the grid after each frame, and takes a forecast of some of them."""
         counts = self._views_by_frame()
         total = max(counts, default=0)
         views = np.linspace(0, total, self.num + 1).round()[1:]
         # At the views; after the last one also what was captured behind it.
         wanted = {*(np.searchsorted(counts, views[views < total]) + 1), len(counts)}
-        for frames, (map_state, grid) in enumerate(states, start=1):
+        for frames, planner in enumerate(states, start=1):
             if frames in wanted:
-                self.add(frames, map_state, grid)
-            yield map_state, grid
+                self.add(frames, planner)
+            yield planner
 
-    def add(self, frames: int, map_state: MapState, grid: OccupancyGrid) -> None:
+    def add(self, frames: int, planner: Planner) -> None:
         """Makes the forecast after this number of frames, if there is none yet."""
         if frames not in self.frames:
             reach = config_of(self.run).max_range
             self.frames.append(frames)
             self.forecasts.append(
-                forecast_map(
-                    map_state,
-                    grid,
+                forecast_planner(
+                    planner,
                     self.run.camera,
                     max_range=reach,
                     calibration=self.calibration,

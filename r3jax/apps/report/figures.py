@@ -18,6 +18,7 @@ from r3jax.formats.posed_images import PosedImages
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.mapping.update import integrate_growing
+from r3jax.planning.planner import Planner
 from r3jax.plots import style
 from r3jax.plots.pictures import floor_picture
 from r3jax.runs.reader import Run
@@ -331,9 +332,7 @@ _MANY = 60
 """From this number of views on, bars touch: gaps would be narrower than a pixel."""
 
 
-def utility_by_cause(
-    run: Run, states: Iterable[tuple[MapState, OccupancyGrid]] | None = None
-) -> np.ndarray:
+def utility_by_cause(run: Run, states: Iterable[Planner] | None = None) -> np.ndarray:
     """Computes the predicted utility of each view of a run when it was chosen, by cause.
 
     Args:

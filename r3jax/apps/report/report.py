@@ -21,8 +21,7 @@ from r3jax.apps.report.figures import (
 )
 from r3jax.apps.report.summary import outcome, stage_times, summary
 from r3jax.files import make_folder, own_folder, write_atomic
-from r3jax.mapping.occupancy import OccupancyGrid
-from r3jax.mapping.state import MapState
+from r3jax.planning.planner import Planner
 from r3jax.plots import style
 from r3jax.plots.page import render
 from r3jax.plots.pictures import panorama_figure, panorama_picture
@@ -89,16 +88,14 @@ Progress = Callable[[str, int], None]
 
 def write_report(
     run: Run,
-    map_state: MapState,
-    grid: OccupancyGrid,
+    planner: Planner,
     on_progress: Progress = lambda stage, steps: None,
 ) -> Path:
     """Writes `report/*.png` and `report/report.html`.
 
     Args:
         run: the run, finished or cut off.
-        map_state: its map after the last view.
-        grid: its coarse grid after the last view.
+        planner: holds its map and its coarse grid after the last view.
         on_progress: for a progress bar; a long run takes minutes to explain.
 
     Returns:
@@ -112,13 +109,14 @@ def write_report(
         raise RunError(run.path, "the run has no views: nothing to report")
     last = run.rows[-1]
     max_range = float(run.header.config.get("max_range", 5.0))
+    map_state, grid = planner.whole_map, planner.whole_grid
     panorama = panorama_picture(map_state, grid, run.camera, last.pose, max_range)
     outlook = Outlook(run)
     drawn: dict[str, Figure | str] = {
         "plan": figures.plan_figure(run, map_state, grid),
         "progress": figures.progress_figure(run),
         "reasons": _reasons(run, outlook, on_progress),
-        "forecast": _forecast(outlook, map_state, grid),
+        "forecast": _forecast(outlook, planner),
         "panorama": panorama_figure(panorama),
         "views": figures.strip_figure(run),
         "cost": figures.cost_figure(run),
@@ -176,8 +174,8 @@ def _counted(states: Iterator[T], on_progress: Progress) -> Iterator[T]:
         yield state
 
 
-def _forecast(outlook: Outlook, map_state: MapState, grid: OccupancyGrid) -> Figure | str:
-    outlook.add(len(outlook.run.rows), map_state, grid)
+def _forecast(outlook: Outlook, planner: Planner) -> Figure | str:
+    outlook.add(len(outlook.run.rows), planner)
     if not outlook.forecasts[-1].mixture.size:
         return " ".join(outlook_lines(outlook))
     return outlook_figure(outlook)

@@ -82,7 +82,7 @@ def begin_team(
     placed, simulators = _with_starts(scenes, settings[0].config.cell_size)
     members = [Member(s, each.policy) for s, each in zip(simulators, settings, strict=True)]
     for member in members:  # refused before there is a folder
-        first_pose(member.simulator, motion_of(member.policy), settings[0].config.cell_size)
+        first_pose(member.simulator, motion_of(member.policy), settings[0].config)
     names = [str(number) for number in range(len(scenes))]
     headers = [
         dataclasses.replace(

@@ -332,6 +332,11 @@ def explore_team(
     """
     config = config or ExplorationConfig()
     budget = parse_budget(budget) if isinstance(budget, str) else budget
+    if config.tiles:
+        raise InputError(
+            "a team shares one map without tiles: explore alone with tiles (`r3jax explore`), and "
+            "merge the runs (`r3jax merge`)"
+        )
     _check(members, meet_every)
     try:
         flying = [

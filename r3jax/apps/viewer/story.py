@@ -9,6 +9,7 @@ the same state and key give the same candidates: a run is decided again for them
 are the same is checked against the trace.
 """
 
+import functools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -27,11 +28,17 @@ from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
-from r3jax.planning.planner import Planner, add_frame, first_map
+from r3jax.planning.planner import Planner, first_map, take_in
 from r3jax.planning.policy import Decision, Policy
 from r3jax.runs.header import RunError, RunHeader
 from r3jax.runs.reader import Run
-from r3jax.runs.replay import Reason, check_decided_alone, explain_run, grid_before
+from r3jax.runs.replay import (
+    Reason,
+    check_decided_alone,
+    explain_run,
+    first_planner,
+    stored_planner,
+)
 from r3jax.runs.settings import config_of
 from r3jax.scoring.config import ScoringConfig
 
@@ -139,13 +146,25 @@ class Moment:
     step: int
     """Number of the view; -1 before the first."""
 
-    map_state: MapState
-    grid: OccupancyGrid
+    planner: Planner
+    """Holds the map and the grid."""
+
+    @functools.cached_property
+    def map_state(self) -> MapState:
+        """The whole map."""
+        return self.planner.whole_map
+
+    @functools.cached_property
+    def grid(self) -> OccupancyGrid:
+        """The whole grid."""
+        return self.planner.whole_grid
 
     @property
     def nbytes(self) -> int:
         """Memory of its arrays [bytes]."""
-        return sum(x.nbytes for x in jax.tree.leaves((self.map_state, self.grid)))
+        far = self.planner.far
+        at_hand = jax.tree.leaves((self.planner.map_state, self.planner.grid))
+        return sum(x.nbytes for x in at_hand) + (0 if far is None else far.tiles.nbytes)
 
 
 def why_no_choice(row: StepRow) -> str:
@@ -170,13 +189,14 @@ class Timeline:
         Raises:
             RunError: settings that cannot work, or a run without a view.
         """
-        self.run, self._config = run, config_of(run)
-        grid = grid_before([run])
-        stored = _stored(run, grid)
-        # Rows enough for the last state from the start on: what works on maps compiles once.
-        capacity = self._config.capacity if stored is None else stored.map_state.capacity
-        state = first_map(replace(self._config, capacity=capacity))
-        self._start = self._reached = Moment(-1, state, grid)
+        self.run = run
+        first = first_planner([run])
+        stored = _stored(run, first)
+        if stored is not None:
+            # Rows enough for the last state from the start on: what works on maps compiles once.
+            config = replace(first.config, capacity=stored.planner.map_state.capacity)
+            first = replace(first, map_state=first_map(config), config=config)
+        self._start = self._reached = Moment(-1, first)
         kept = max(2, memory // self._start.nbytes)
         self.stride = math.ceil(len(run.rows) / kept)
         """Views from one kept state to the next."""
@@ -230,8 +250,8 @@ class Timeline:
 
     def _after(self, moment: Moment) -> Moment:
         """Computes the state one view later, and stores it for later use."""
-        config, frame = self._config, self.run.frame(moment.step + 1)
-        after = Moment(moment.step + 1, *add_frame(moment.map_state, moment.grid, frame, config))
+        frame = self.run.frame(moment.step + 1)
+        after = Moment(moment.step + 1, take_in(moment.planner, frame))
         if after.step % self.stride == 0:
             self._kept[after.step] = after
         if after.step > self._reached.step:
@@ -239,23 +259,22 @@ class Timeline:
         return after
 
 
-def _stored(run: Run, grid: OccupancyGrid) -> Moment | None:
+def _stored(run: Run, first: Planner) -> Moment | None:
     """Reads the last view's state from its checkpoint; returns None if it must be replayed."""
     try:
-        step, map_state, stored_grid = run.checkpoint()
+        step, planner = stored_planner(run)
     except RunError:
         return None
-    config = config_of(run)
+    state, config = planner.map_state, first.config
     is_ours = (
         step == len(run.rows) - 1
-        and map_state.num_bins == config.num_bins
-        and map_state.key.shape == (2, map_state.capacity)
-        and map_state.mean.shape == (3, map_state.capacity)
-        and map_state.capacity & (map_state.capacity - 1) == 0
-        and float(map_state.voxel_size) == np.float32(config.voxel_size)
-        and stored_grid.log_odds.shape == grid.log_odds.shape
+        and state.key.shape == (2, state.capacity)
+        and state.mean.shape == (3, state.capacity)
+        and state.capacity & (state.capacity - 1) == 0
+        and float(state.voxel_size) == np.float32(config.voxel_size)
+        and planner.grid.log_odds.shape == first.grid.log_odds.shape
     )
-    return Moment(step, map_state, stored_grid) if is_ours else None
+    return Moment(step, planner) if is_ours else None
 
 
 _THUMBNAIL = 256
@@ -381,7 +400,10 @@ class RecordedStory:
         if self._run.header.is_of_team:
             self._problem = "decided on what the others of a team had seen, too"
             return (None for _ in moments)
-        return explain_run(self._run, ((m.map_state, m.grid) for m in moments))
+        if config_of(self._run).tiles:
+            self._problem = "in the report: a page of a run with tiles does not show it by voxel"
+            return (None for _ in moments)
+        return explain_run(self._run, (m.planner for m in moments))
 
     def offer(self, step: int) -> Offer | None:
         """Returns None: the trace does not contain the candidates."""
@@ -444,7 +466,7 @@ class LiveStory:
         if view.decision is not None:
             self._offers[view.row.step] = offer_of(view.decision)
         self._offers.pop(view.row.step - _OFFERS_KEPT, None)
-        self._moment = Moment(view.row.step, planner.map_state, planner.grid)
+        self._moment = Moment(view.row.step, planner)
         self._rows.append(view.row)
 
     def image(self, step: int) -> np.ndarray:

@@ -250,9 +250,8 @@ def _conclude(console: Console, path: Path, result: Result) -> None:
         with Stages(console) as stages:
             stages.on_progress("writing the data set", 0)
             run = read_run(path)
-            write_data_set(run, result.state.map_state)
-            state = result.state
-            page = write_report(run, state.map_state, state.grid, stages.on_progress)
+            write_data_set(run, result.state.planner.whole_map)
+            page = write_report(run, result.state.planner, stages.on_progress)
     except (RunError, OSError) as error:
         console.say(f"the report could not be written: {one_line(error)}")
         return
@@ -335,9 +334,12 @@ def _conclude_team(console: Console, folder: Path, result: TeamResult) -> None:
         with Stages(console) as stages:
             stages.on_progress("writing the data sets", 0)
             runs = write_team_data(folder, result)
+            common = {"map_state": result.map_state, "grid": result.grid}
             pages = [
-                write_report(run, result.map_state, result.grid, stages.on_progress) for run in runs
-            ]
+                write_report(run, dataclasses.replace(member.state.planner, **common),
+                             stages.on_progress)
+                for run, member in zip(runs, result.members, strict=True)
+            ]  # fmt: skip
     except (RunError, OSError) as error:
         console.say(f"the data set could not be written: {one_line(error)}")
         return

@@ -25,6 +25,7 @@ from r3jax.formats.captures import open_capture
 from r3jax.formats.points import write_points
 from r3jax.formats.ros.bags import parse_topics
 from r3jax.runs.header import package_versions
+from r3jax.runs.replay import stored_planner
 from r3jax.splatting.backend import RasterConfig
 from r3jax.splatting.errors import TrainingDiverged
 from r3jax.splatting.model import check_free, find_model, only_writer, scene_points, write_model
@@ -130,11 +131,11 @@ def run_evaluate(options: EvaluateOptions) -> int:
             own_folder(capture.path, "run")
         written = write_judgment(judgment, folder, options.views, results.rows, results.worst)
         if capture.run is not None and folder == default:
-            _, state, grid = capture.run.checkpoint()
+            _, planner = stored_planner(capture.run)
             # Lazy import: training needs no plots.
             from r3jax.apps.report.report import write_report
 
-            written["report"] = write_report(capture.run, state, grid, stages.on_progress)
+            written["report"] = write_report(capture.run, planner, stages.on_progress)
     _show_judgment(Console(), judgment, written)
     if capture.run is not None:
         which = () if options.name == EvaluateOptions.name else ("--name", options.name)

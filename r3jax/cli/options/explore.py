@@ -38,8 +38,8 @@ MapAndClock = FieldsOf("voxel_size", "cell_size", "max_range", "capacity", "cloc
 """Settings of the loop that a team has."""
 
 Loop = FieldsOf(
-    *MapAndClock.names, "until", "capture_every", "capture_rate", "gaze", "exposure", "blur",
-    "plan_while_moving",
+    *MapAndClock.names, "tiles", "until", "capture_every", "capture_rate", "gaze", "exposure",
+    "blur", "plan_while_moving",
 )  # fmt: skip
 """Settings of the loop for one camera."""
 

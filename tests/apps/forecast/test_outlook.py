@@ -72,7 +72,8 @@ def whole(tmp_path_factory):
 def reached(whole):
     """The forecasts of the mean after each view, by brute force: a replay and a forecast each."""
     run = read_run(whole[1])
-    return [forecast_map(*state, run.camera).value("mean") for state in states_of(run)]
+    return [forecast_map(planner.map_state, planner.grid, run.camera).value("mean")
+            for planner in states_of(run)]  # fmt: skip
 
 
 def test_a_run_ends_when_its_forecast_says_so(whole, reached, tmp_path):
@@ -114,7 +115,7 @@ def test_an_outlook_watches_a_replay(whole, reached):
     assert outlook.views == [3, 6, 9]
     values = [forecast.value("mean") for forecast in outlook.forecasts]
     np.testing.assert_array_equal(values, [reached[2], reached[5], reached[8]])
-    outlook.add(9, whole[0].state.map_state, whole[0].state.grid)  # known already
+    outlook.add(9, whole[0].state.planner)  # known already
     assert outlook.views == [3, 6, 9]
 
 

@@ -22,8 +22,6 @@ from r3jax.apps.report.report import write_report
 from r3jax.apps.report.summary import map_row_bytes, stage_times, summary
 from r3jax.exploration import explore
 from r3jax.exploration.config import ExplorationConfig
-from r3jax.mapping.occupancy import empty_grid
-from r3jax.mapping.state import empty_map
 from r3jax.plots import style
 from r3jax.runs.header import RunError, camera_fields
 from r3jax.runs.reader import read_run
@@ -57,7 +55,7 @@ def reported(tmp_path_factory):
         else:
             stages[-1][2] += steps
 
-    page = write_report(run, result.state.map_state, result.state.grid, on_progress)
+    page = write_report(run, result.state.planner, on_progress)
     assert stages == [["explaining the views", 3, 3], ["drawing the report", 7, 7]]
     return run, result, page
 
@@ -161,17 +159,17 @@ def test_a_run_that_cannot_be_explained_has_a_report_all_the_same(reported, tmp_
     header = dataclasses.replace(run.header, parent={"merged": ["a", "b"], "merged_views": [2, 2]})
     shutil.rmtree(tmp_path / "merged" / "report")
     merged = dataclasses.replace(run, path=tmp_path / "merged", header=header)
-    page = write_report(merged, result.state.map_state, result.state.grid)
+    page = write_report(merged, result.state.planner)
     assert "Not known" in page.read_text()
     assert not (page.parent / "reasons.png").exists()
 
 
-def test_a_run_without_views_has_no_report(tmp_path):
+def test_a_run_without_views_has_no_report(reported, tmp_path):
     with RunWriter(tmp_path / "run", make_header()):
         pass
     run = read_run(tmp_path / "run")
     with pytest.raises(RunError, match="no view"):
-        write_report(run, empty_map(64), empty_grid(np.array([[0.0] * 3, [1.0] * 3])))
+        write_report(run, reported[1].state.planner)
     assert summary(run)["views"] == "0"
 
 
@@ -182,7 +180,7 @@ def test_a_run_that_was_cut_off_can_be_reported(reported, tmp_path):
     (tmp_path / "cut" / "run.json").write_bytes((run.path / "run.json").read_bytes())
     (tmp_path / "cut" / "trace.jsonl").write_text("".join(rows[:2]))
     (tmp_path / "cut" / "frames").symlink_to(run.path / "frames")
-    page = write_report(read_run(tmp_path / "cut"), result.state.map_state, result.state.grid)
+    page = write_report(read_run(tmp_path / "cut"), result.state.planner)
     assert "cut off" in page.read_text()
 
 

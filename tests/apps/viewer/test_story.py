@@ -31,7 +31,7 @@ def expected(run):
 
 
 def assert_is(moment, step, expected):
-    map_state, grid = expected[step]
+    map_state, grid = expected[step].map_state, expected[step].grid
     assert moment.step == step
     assert content(moment.map_state) == content(map_state)
     np.testing.assert_array_equal(moment.grid.log_odds, grid.log_odds)
