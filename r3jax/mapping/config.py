@@ -42,7 +42,7 @@ class MappingConfig:
 
     tiles: bool = False
     """Hold what lies round the robot at hand and all else in tiles: for places larger than a house,
-    and the policies r3 and r3-pano. The capacity then follows from range and voxel size."""
+    with r3, r3-pano, r3-ahead or frontier. The capacity then follows from range and voxel size."""
 
     max_range: float = 5.0
     """Range of the depth sensor [m]."""

@@ -136,6 +136,9 @@ class GreedyPolicy(ABC):
     Config: ClassVar[type[PlannerConfig]] = PlannerConfig
     """Its settings."""
 
+    memory_by_cell: ClassVar[bool] = False
+    """True if its memory marks frontier cells that need no further view, [X, Y, Z] bool."""
+
     def first_memory(self, camera: Camera, grid: OccupancyGrid) -> Any:
         """Returns the policy's memory before the first frame: none."""
         del camera, grid
@@ -159,6 +162,18 @@ class GreedyPolicy(ABC):
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
         """Computes the `total` of each candidate from `utility` and `path` [C]: U_view."""
         return net_utility(utilities["utility"], utilities["path"], self.config.lambda2)
+
+    def weigh_far(self, near: dict[str, np.ndarray], far: dict[str, np.ndarray]) -> np.ndarray:
+        """Computes the totals of C candidates and of f goals far away, [C + f].
+
+        Args:
+            near: scores of the candidates and `path`, [C]; empty if there are none.
+            far: `utility` and others that were computed when the goals were left, and `path`, [f].
+        """
+        names = near.keys() & far.keys() if near else far.keys()
+        both = {name: np.concatenate([near[name], far[name]]) if near else far[name]
+                for name in names}  # fmt: skip
+        return self.weigh(both)
 
     def conclude(
         self,

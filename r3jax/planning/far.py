@@ -1,15 +1,15 @@
-"""Far places: tiles, paths back to them, and views left for later.
+"""Far places: tiles, goals there, and paths to them.
 
 A planner that was started without bounds, or with `MappingConfig(tiles=True)`, holds a block of
 tiles (`mapping.tiles`): policies draw and score in it as in a house, and depend on nothing else.
-Goals lie so far within it that all that they may see is at hand. Views that were scored and not
-taken are kept when the robot goes away: they are scored once more when they leave the block, and
-nothing changes there until it comes back. Each decision weighs them against the views on offer,
-with the length of the paths to them, as the policy weighs. A robot that takes one goes back, over
-cells that it has come through, to where the view was found; the next decision has the place at
-hand.
+Goals lie so far within it that all that they may see is at hand. Two kinds of goals lie elsewhere:
+views that were scored and not taken, and frontiers (`planning.far_paths`). Both are scored when
+they leave the block, and nothing changes there until it comes back. Each decision weighs them
+against the views on offer, with the lengths of the shortest paths through all tiles, as the policy
+weighs. A robot that takes one goes to the place from which it can be seen; the next decision has
+all of it at hand.
 
-Shape symbols: n cells; v views; X Y Z cells at hand.
+Shape symbols: n cells; m columns; v views; X Y Z cells at hand.
 """
 
 import functools
@@ -49,9 +49,22 @@ from r3jax.mapping.tiles import (
     with_arrays,
 )
 from r3jax.planning.candidates import candidates_along
+from r3jax.planning.config import PlannerConfig
 from r3jax.planning.decide import GreedyPolicy, PlannerState, look_round
+from r3jax.planning.far_paths import (
+    Coarse,
+    Lengths,
+    cell_of,
+    clearance_of,
+    connected_within,
+    known_cells,
+    lengths_from,
+    path_along,
+    refreshed,
+    with_closed,
+)
 from r3jax.planning.policy import Decision, LivesOutside, Policy
-from r3jax.planning.robot.limits import Limits
+from r3jax.planning.robot.limits import Limits, angles_along, rotations
 
 _BLOCK = 1.0
 """Of views so close together [m] the best is kept."""
@@ -60,7 +73,14 @@ _RETURN = 1.0
 """A robot that stands at most this far from a cell that it has come through [m] came from there."""
 
 
-_KINDS = {"log_odds": "<f4", "looks": "<i4"}
+_ARRIVED = 0.5
+"""A robot at most this far from the goal that it went to [m] has arrived."""
+
+_LIMITS = 30.0, np.inf
+"""Paths are searched for up to these lengths in turn [m], until enough goals are found: a search
+over a whole building takes ten times as long."""
+
+_KINDS = {"log_odds": "<f4", "looks": "<i4", "memory": "|b1"}
 """Stored fields of cells, and their types."""
 
 
@@ -79,6 +99,11 @@ class Views(NamedTuple):
     values: Mapping[str, np.ndarray]
     """Numbers of the policy, by name, [v] each."""
 
+    @property
+    def position(self) -> np.ndarray:
+        """Where the camera would be, [v, 3] [m]."""
+        return self.pose[:, :3, 3]
+
     def take(self, which: np.ndarray) -> "Views":
         """Gathers views by index or mask."""
         values = {name: x[which] for name, x in self.values.items()}
@@ -89,9 +114,15 @@ NO_VIEWS = Views(np.zeros((0, 4, 4)), np.zeros((0, 3)), np.zeros(0), {})
 
 
 def _joined(a: Views, b: Views) -> Views:
+    """Joins views; numbers that only some of them have are 0 for the others."""
     if not len(a.path) or not len(b.path):
         return a if len(a.path) else b
-    values = {name: np.concatenate([a.values[name], x]) for name, x in b.values.items()}
+    none = np.zeros(len(a.path)), np.zeros(len(b.path))
+    names = dict.fromkeys([*a.values, *b.values])
+    values = {
+        name: np.concatenate([x.values.get(name, y) for x, y in zip((a, b), none, strict=True)])
+        for name in names
+    }
     pose, place, path = (np.concatenate([x, y]) for x, y in zip(a[:3], b[:3], strict=True))
     return Views(pose, place, path, values)
 
@@ -109,6 +140,9 @@ class Far:
     border: float
     """Goals keep this far from the block's faces, so that what they may see is at hand [m]."""
 
+    coarse: Coarse
+    """The graph of all open cells. Near tiles as of the latest decision."""
+
     views: Views = NO_VIEWS
     """Views left for later."""
 
@@ -121,8 +155,17 @@ class Far:
     costs: tuple[np.ndarray, float] = (np.zeros((0, 2)), 0.0)
     """Lower corners of a costmap's closed pixels, [k, 2] [m], and their edge [m]."""
 
+    mask: tuple[np.ndarray, float] = (np.zeros((0, 2)), 0.0)
+    """Lower corners of columns that no robot may enter, [k, 2] [m], and their edge [m]."""
+
     refused: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
     """Goals that could not be reached, and the radii round them, [k, 4] [m]."""
+
+    goal: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
+    """Where the robot is going to, and the view that it seeks there, [0 or 1, 6] [m]."""
+
+    tried: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    """Far goals at which the robot has arrived, [k, 3] [m]."""
 
     @property
     def first_cell(self) -> np.ndarray:
@@ -229,7 +272,7 @@ class Far:
         # One structure for all blocks: another one would be compiled for.
         if np.isfinite(self.box[:, is_cut]).any():
             grid = replace(grid, explorable=jnp.asarray(inside))
-        columns = np.zeros(lattice.shape[:2], bool)
+        columns = pixel_columns(grid, *self.mask)
         for zone in self.zones:
             columns |= columns_in(grid, zone)
         fill = lambda columns: np.broadcast_to(columns[:, :, None], lattice.shape)
@@ -264,7 +307,7 @@ def first_far(
             f"the policy scores views up to {sees:g} m, but tiles at hand may end "
             f"{_least_half(lattice):g} m from the robot: give its scoring a shorter max_range"
         )
-    return Far(Tiles(lattice, (x, y, z), capacity), box, border)
+    return Far(Tiles(lattice, (x, y, z), capacity), box, border, Coarse(lattice))
 
 
 def _least_half(lattice: Lattice) -> float:
@@ -279,12 +322,17 @@ def check_policy(policy: Policy, policy_state: Any) -> None:
     Raises:
         ValueError: names the policy, and what to do.
     """
-    is_plain = isinstance(policy_state, PlannerState) and not jax.tree.leaves(policy_state.memory)
-    weighs = getattr(type(policy), "weigh", None) is GreedyPolicy.weigh
+    kind, state = type(policy), policy_state
+    is_plain = isinstance(state, PlannerState) and (
+        not jax.tree.leaves(state.memory) or getattr(kind, "memory_by_cell", False)
+    )
+    weighs = getattr(kind, "weigh", None) is GreedyPolicy.weigh
+    weighs |= getattr(kind, "weigh_far", None) is not getattr(GreedyPolicy, "weigh_far", None)
     if not is_plain or not weighs or isinstance(policy, LivesOutside):
         raise InputError(
             f"the policy {policy.name!r} has a memory or a measure of its own for the whole place, "
-            "which cannot be cut into tiles: give finite bounds and no tiles, or use r3 or r3-pano"
+            "which cannot be cut into tiles: give finite bounds and no tiles, or use r3, r3-pano, "
+            "r3-ahead or frontier"
         )
 
 
@@ -297,12 +345,17 @@ def moved_to(known: Known, policy: GreedyPolicy, position: np.ndarray) -> Known:
     map_state, grid, memory, far = known
     if middle_for(far.tiles, position) == far.tiles.middle:
         return known
+    far = with_coarse(far, grid, memory, policy.config)
     layers = {"log_odds": np.asarray(grid.log_odds), "looks": memory.looks}
+    if memory.memory is not None:
+        layers["memory"] = memory.memory
     after, layers, tiles = page(map_state, layers, far.tiles, position)
     # Before they are out of hand: what they promise stays true until the robot comes back.
-    views = _renewed(known, policy, tiles.middle)
+    views = _renewed((map_state, grid, memory, far), policy, tiles.middle, position)
     far = replace(far, tiles=tiles, views=views)
-    memory = replace(memory, looks=layers["looks"], trail=far.trail)
+    memory = replace(
+        memory, looks=layers["looks"], trail=far.trail, memory=layers.get("memory", memory.memory)
+    )
     return after, far.grid(layers["log_odds"]), memory, far
 
 
@@ -317,6 +370,29 @@ def known_round(
     return state, replace(far, tiles=tiles).grid(layers["log_odds"])
 
 
+def with_coarse(far: Far, grid: OccupancyGrid, memory: PlannerState, config: PlannerConfig) -> Far:
+    """Brings the coarse level up to date with the cells at hand."""
+    start = None if memory.start_height is None else float(memory.start_height)
+    if start is not None and np.isnan(start):
+        return far  # no decision yet: the robot's heights are not known
+    lattice, size = far.tiles.lattice, np.array(far.tiles.lattice.cells)
+    cells = known_cells(np.asarray(grid.log_odds), memory.looks, memory.memory)
+    now: dict[Tile, np.ndarray] = {}
+    for tile in lattice.block(far.tiles.middle):
+        low = np.array(tile) * size - far.first_cell
+        now[tile] = cells[tuple(slice(a, a + n) for a, n in zip(low, size, strict=True))]
+    # Of a planner that was loaded, or where zones have changed.
+    for tile in far.tiles.cells.keys() - far.coarse.tiles.keys():
+        layers = far.tiles.cells[tile]
+        none = np.zeros(lattice.cells, np.float32)
+        found = {name: unpacked_layer(x, lattice.cells) for name, x in layers.items()}
+        now[tile] = known_cells(
+            found.get("log_odds", none), found.get("looks", none), found.get("memory")
+        )
+    clearance = clearance_of(config, start)
+    return replace(far, coarse=refreshed(far.coarse, now, far.trails, clearance, far.box))
+
+
 def _at_hand(far: Far, positions: np.ndarray, middle: Tile) -> np.ndarray:
     """Finds which positions [v, 3] goals may have in the block round a tile, [v] bool."""
     lattice = far.tiles.lattice
@@ -326,30 +402,81 @@ def _at_hand(far: Far, positions: np.ndarray, middle: Tile) -> np.ndarray:
     return np.all(is_in | (np.array(lattice.num) == 1), axis=1)
 
 
-def _renewed(known: Known, policy: GreedyPolicy, middle: Tile) -> Views:
-    """Scores those views again that are at hand, and will not be round another tile."""
+def _renewed(known: Known, policy: GreedyPolicy, middle: Tile, position: np.ndarray) -> Views:
+    """Scores views and frontiers that are at hand, and will not be round another tile.
+
+    Args:
+        known: before the block moves.
+        policy: which scores.
+        middle: where the block moves to.
+        position: of the robot, [3] [m].
+    """
     map_state, grid, memory, far = known
-    views, position = far.views, far.views.pose[:, :3, 3]
-    leaves = _at_hand(far, position, far.tiles.middle) & ~_at_hand(far, position, middle)
-    old = views.take(np.flatnonzero(leaves)[: policy.config.num_candidates])
-    if not len(old.path):
+    most, views = policy.config.num_candidates, far.views
+    after = functools.partial(_at_hand, far, middle=middle)
+    leaves = _at_hand(far, views.position, far.tiles.middle) & ~after(views.position)
+    old = views.take(np.flatnonzero(leaves)[:most])
+    kept = views.take(~leaves) if len(old.path) else views
+    goals = _frontier_goals(far, policy)
+    is_new = _in_block(far, goals.place) & ~after(goals.place)
+    goals = goals.take(np.flatnonzero(is_new)[: most - len(old.path)])
+    both = _joined(old, goals)
+    if not len(both.path):
         return views
-    kept = views.take(~leaves)
     here, lattice = np.eye(4), far.tiles.lattice
     center = lattice.corner(far.tiles.middle) + 0.5 * np.array(lattice.shape) * lattice.cell_size
-    here[:3, 3] = old.place[np.argmin(np.linalg.norm(old.place - center, axis=1))]
+    if len(old.path) or not _in_block(far, position[None])[0]:
+        position = both.place[np.argmin(np.linalg.norm(both.place - center, axis=1))]
+    here[:3, 3] = position
     try:
         _, situation = look_round(memory, map_state, grid, here, policy.config)
     except InputError:  # that place lies out of the heights that are allowed now
         return kept
-    offered = candidates_along(old.pose[:, :3, 3], old.pose[:, :3, 2])
-    padded = offered.padded(policy.config.num_candidates)
-    scored, values = policy.score(situation, padded, key=jax.random.key(0))
-    num = len(old.path)
+    offered = candidates_along(both.position, both.pose[:, :3, 2])
+    scored, values = policy.score(situation, offered.padded(most), key=jax.random.key(0))
+    if "utility" not in values:
+        return views
+    num = len(both.path)
     pose = scored.T_world_camera[:num]
-    renewed = {name: np.asarray(values[name])[:num] for name in old.values if name in values}
-    fresh = Views(pose, old.place, old.path, renewed)
+    renewed = {name: np.asarray(x)[:num] for name, x in values.items()}
+    fresh = Views(pose, both.place, both.path, renewed)
     return _joined(kept, fresh.take(scored.valid[:num] & (renewed["utility"] > 0.0)))
+
+
+def _in_block(far: Far, positions: np.ndarray) -> np.ndarray:
+    """Finds which positions [v, 3] lie in the block at hand, [v] bool."""
+    cells = cell_of(far.tiles.lattice, positions) - far.first_cell
+    return np.all((cells >= 0) & (cells < far.tiles.lattice.shape), axis=1)
+
+
+def _frontier_goals(far: Far, policy: GreedyPolicy) -> Views:
+    """Lists places that see a frontier, where no view was scored and the robot has not gone to.
+
+    Their utility is that of as many unexplored cells as there are frontier cells: less than a view
+    would show.
+    """
+    lattice, goals, motion = far.tiles.lattice, far.coarse.goals, policy.config.motion
+    center = lambda cells: np.array(lattice.origin) + (cells + 0.5) * lattice.cell_size
+    place = center(goals.place)
+    place[:, 2] = np.clip(place[:, 2], *far.coarse.clearance.heights)
+    is_new = ~_are_near(place, far.tried) & ~_are_near(place, far.views.position)
+    place, aim = place[is_new], center(goals.aim)[is_new]
+    pose = np.tile(np.eye(4), (len(place), 1, 1))
+    pose[:, :3, 3] = place
+    pose[:, :3, :3] = rotations(*Limits(motion).clipped(*angles_along(aim - place)))
+    utility = float(policy.config.scoring.lambda1) * goals.num[is_new]
+    values = {"utility": utility, "exploration": utility}
+    return Views(pose, place, np.zeros(len(place)), values)
+
+
+def _are_near(places: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Finds places [v, 3] within `_BLOCK` of others [k, 3], [v] bool."""
+    from scipy.spatial import KDTree
+
+    if not len(places) or not len(others):
+        return np.zeros(len(places), bool)
+    gap, _ = KDTree(others).query(places, distance_upper_bound=_BLOCK)
+    return np.isfinite(gap)
 
 
 def with_views(far: Far, decision: Decision, here: np.ndarray, radius: float) -> Far:
@@ -377,59 +504,95 @@ def with_views(far: Far, decision: Decision, here: np.ndarray, radius: float) ->
 def weigh_far(
     far: Far, policy: GreedyPolicy, decision: Decision | None, T_here: np.ndarray
 ) -> tuple[Decision | None, Far]:
-    """Weighs views left for later against a decision; returns the better one.
+    """Weighs far goals against a decision; returns the better one.
 
     Args:
-        far: record of far places, including the path to here.
+        far: record of far places, with a coarse level that is up to date.
         policy: which weighs.
         decision: decision within the block; None if there is no goal.
         T_here: pose of the robot, [4, 4].
     """
     here = T_here[:3, 3]
-    is_far = ~_at_hand(far, far.views.pose[:, :3, 3], far.tiles.middle)
-    if not is_far.any():
+    views, lengths = _goals_by_path(far, policy, here)
+    if lengths is None:
         return decision, far
-    index = np.flatnonzero(is_far)
-    views = far.views.take(index)
-    length, previous = _lengths(far, here)
-    path = length[_nodes(far, views.place)] + views.path
-    for goal in far.refused:
-        path[np.linalg.norm(views.place - goal[:3], axis=1) <= goal[3]] = np.inf
-    near = np.argsort(path, kind="stable")[: max(policy.config.num_frontier, 1)]
-    near = near[np.isfinite(path[near])]
-    if not len(near):
-        return decision, far
-    views, path, index = views.take(near), path[near], index[near]
-    values = dict(views.values) | {"path": path}
-    num = 0
-    if decision is not None:
-        num = len(decision.candidates)
-        values = {name: np.concatenate([decision.utilities[name], x])
-                  for name, x in values.items() if name in decision.utilities}  # fmt: skip
-    total = np.where(np.isfinite(values["path"]), policy.weigh(values), -np.inf)
+    near = {} if decision is None else decision.utilities
+    values = dict(views.values) | {"path": views.path}
+    num = 0 if decision is None else len(decision.candidates)
+    is_reached = np.isfinite(np.concatenate([near["path"] if near else [], views.path]))
+    total = np.where(is_reached, policy.weigh_far(near, values), -np.inf)
     best = int(np.argmax(total))
     if best < num:
         return decision, far
-    chosen = best - num
-    pose = views.pose[chosen].copy()
-    pose[:3, 3] = views.place[chosen]
-    waypoints = _path_back(far, previous, here, pose[:3, 3])
+    pose, place = views.pose[best - num].copy(), views.place[best - num]
+    goal = np.concatenate([place, pose[:3, 3]])[None]
+    pose[:3, 3] = place
+    waypoints = path_along(far.coarse, lengths, here, place)
     poses = views.pose if decision is None else np.concatenate([decision.candidates, views.pose])
     poses = np.array(poses)
     poses[best] = pose
-    kept = np.ones(len(far.views.path), bool)
-    kept[index[chosen]] = False  # once it is at hand again, it is drawn again if it still promises
+    if near:
+        none = np.zeros(len(views.path))
+        values = {name: np.concatenate([x, values.get(name, none)]) for name, x in near.items()}
     walk = float(np.linalg.norm(np.diff(waypoints, axis=0), axis=1).sum())
     seconds = Limits(policy.config.motion, T_here).seconds(walk, pose[:3, 2])
     taken = Decision(pose, waypoints, walk, float(total[best]), poses,
                      values | {"total": total}, seconds)  # fmt: skip
-    return taken, replace(far, views=far.views.take(kept))
+    return taken, replace(far, goal=goal)
+
+
+def _goals_by_path(
+    far: Far, policy: GreedyPolicy, here: np.ndarray
+) -> tuple[Views, Lengths | None]:
+    """Finds the nearest goals that are not at hand, or to which no path within the block leads.
+
+    Returns:
+        Goals, with whole paths; and the paths to all places, None without a goal.
+    """
+    lattice, coarse = far.tiles.lattice, far.coarse
+    views = _joined(far.views, _frontier_goals(far, policy))
+    if not len(views.path):
+        return NO_VIEWS, None
+    start, cells = cell_of(lattice, here), cell_of(lattice, views.place)
+    is_far = ~_at_hand(far, views.position, far.tiles.middle)
+    inside = np.flatnonzero(~is_far)
+    block = lattice.block(far.tiles.middle)
+    is_far[inside] = ~connected_within(coarse, block, start, cells[inside])
+    for goal in far.refused:
+        is_far &= np.linalg.norm(views.place - goal[:3], axis=1) > goal[3]
+    views, cells = views.take(is_far), cells[is_far]
+    if not len(views.path):
+        return NO_VIEWS, None
+    node, steps = coarse.nodes(cells)
+    most, size = max(policy.config.num_frontier, 1), lattice.cell_size
+    lengths, path, nearest = None, views.path, np.arange(0)
+    for limit in _LIMITS:
+        lengths = lengths_from(coarse, start, limit / size)
+        if lengths is None:
+            return NO_VIEWS, None
+        path = np.where(node < 0, np.inf, lengths.cost[node] + steps) * size + views.path
+        nearest = np.argsort(path, kind="stable")[:most]
+        if len(nearest) == most and path[nearest[-1]] <= limit:
+            break
+    nearest = nearest[np.isfinite(path[nearest])]
+    views = views.take(nearest)._replace(path=path[nearest])
+    return views, lengths if len(nearest) else None
 
 
 def arrived(far: Far, here: np.ndarray) -> Far:
-    """Adds the robot's own place to the trails, and the line to the nearest cell if it is near."""
+    """Records the robot's own place.
+
+    It joins the trails, with the line to the nearest cell of them if that is near. A goal at which
+    the robot has arrived is none any more: views of it are drawn again.
+    """
+    if len(far.goal) and np.linalg.norm(far.goal[0, :3] - here) <= _ARRIVED:
+        place, views = far.goal[:, :3], far.views
+        sought = np.concatenate([views.place, views.position], axis=1)
+        is_left = np.any(np.abs(sought - far.goal) > 1e-6, axis=1)
+        tried = np.concatenate([far.tried, place])
+        far = replace(far, views=views.take(is_left), tried=tried, goal=far.goal[:0])
     lattice = far.tiles.lattice
-    cell = np.floor((here - np.array(lattice.origin)) / lattice.cell_size).astype(np.int64)
+    cell = cell_of(lattice, here)
     cells = [cell]
     if len(far.trails):
         gap = np.linalg.norm(far.trails - cell, axis=1)
@@ -437,48 +600,27 @@ def arrived(far: Far, here: np.ndarray) -> Far:
         if gap[nearest] == 0.0:
             return far
         if gap[nearest] * lattice.cell_size <= _RETURN:
-            steps = np.linspace(far.trails[nearest], cell, 2 * int(np.ceil(gap[nearest])) + 1)
-            line = np.unique(np.round(steps).astype(np.int64), axis=0)
-            cells = [c for c in line if not np.all(far.trails == c, axis=1).any()]
+            # Over faces, as all paths are.
+            for axis in range(3):
+                while cells[-1][axis] != far.trails[nearest][axis]:
+                    step = np.zeros(3, np.int64)
+                    step[axis] = np.sign(far.trails[nearest][axis] - cells[-1][axis])
+                    cells.append(cells[-1] + step)
+            cells.pop()  # the nearest is on them already
     return replace(far, trails=np.concatenate([far.trails, np.array(cells)]))
 
 
-def _nodes(far: Far, places: np.ndarray) -> np.ndarray:
-    """Finds the number of the trails' cell nearest to each place [v, 3], [v]."""
-    from scipy.spatial import KDTree
-
+def with_closed_columns(far: Far) -> Far:
+    """Closes the columns of zones, masks and costmaps on the coarse level, after they changed."""
     lattice = far.tiles.lattice
-    cells = (places - np.array(lattice.origin)) / lattice.cell_size - 0.5
-    return np.asarray(KDTree(far.trails).query(cells)[1])
-
-
-def _lengths(far: Far, here: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Finds the shortest paths from here to all cells of the trails: lengths [m], cells before."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import dijkstra
-    from scipy.spatial import KDTree
-
-    # The 26 neighbors; all cells of the trails are safe, so that no step cuts a corner.
-    pairs = KDTree(far.trails).query_pairs(1.8, output_type="ndarray")
-    pairs = pairs[~_closed(far)[pairs].any(axis=1)]
-    length = np.linalg.norm(far.trails[pairs[:, 0]] - far.trails[pairs[:, 1]], axis=1)
-    num = len(far.trails)
-    graph = coo_array((length, (pairs[:, 0], pairs[:, 1])), shape=(num, num)).tocsr()
-    start = int(_nodes(far, here[None])[0])
-    cost, previous = dijkstra(graph, directed=False, indices=start, return_predecessors=True)
-    return cost * far.tiles.lattice.cell_size, previous
-
-
-def _closed(far: Far) -> np.ndarray:
-    """Finds the cells of the trails that lie in zones or in a costmap's obstacles, [n] bool."""
-    lattice, is_closed = far.tiles.lattice, np.zeros(len(far.trails), bool)
     origin, size = np.array(lattice.origin), lattice.cell_size
-    corners, edge = far.costs
     areas: list[tuple[np.ndarray, Callable[[OccupancyGrid], np.ndarray]]]
     areas = [(zone, functools.partial(columns_in, corners=zone)) for zone in far.zones]
-    if len(corners):
-        columns_of = functools.partial(pixel_columns, corners=corners, resolution=edge)
-        areas.append((np.concatenate([corners, corners + edge]), columns_of))
+    for corners, edge in (far.mask, far.costs):
+        if len(corners):
+            columns_of = functools.partial(pixel_columns, corners=corners, resolution=edge)
+            areas.append((np.concatenate([corners, corners + edge]), columns_of))
+    found = [np.zeros((0, 2), np.int64)]
     for points, columns_of in areas:
         low = np.floor((points.min(axis=0) - origin[:2]) / size).astype(np.int64)
         num = np.ceil((points.max(axis=0) - origin[:2]) / size).astype(np.int64) - low
@@ -487,25 +629,8 @@ def _closed(far: Far) -> np.ndarray:
             jnp.asarray(origin + np.append(low, 0) * size, jnp.float32),
             jnp.asarray(size, jnp.float32),
         )
-        column = far.trails[:, :2] - low
-        is_in = np.all((column >= 0) & (column < num), axis=1)
-        is_closed[is_in] |= columns_of(grid)[tuple(column[is_in].T)]
-    return is_closed
-
-
-def _path_back(far: Far, previous: np.ndarray, here: np.ndarray, there: np.ndarray) -> np.ndarray:
-    """Follows a path from here to there: its corners, [K, 3] [m]."""
-    node = int(_nodes(far, there[None])[0])
-    cells: list[np.ndarray] = []
-    while node >= 0:
-        cells.append(far.trails[node])
-        node = int(previous[node])
-    path = np.array(cells[::-1])
-    turns = np.any(np.diff(path[1:], axis=0) != np.diff(path[:-1], axis=0), axis=1)
-    path = path[np.r_[True, turns, True]] if len(path) > 2 else path
-    lattice = far.tiles.lattice
-    middle = np.array(lattice.origin) + (path + 0.5) * lattice.cell_size
-    return np.concatenate([here[None], middle[1:-1], there[None]])
+        found.append(np.argwhere(columns_of(grid)) + low)
+    return replace(far, coarse=with_closed(far.coarse, np.concatenate(found)))
 
 
 def columns_in(grid: OccupancyGrid, corners: np.ndarray) -> np.ndarray:
@@ -541,7 +666,9 @@ def far_arrays(far: Far) -> dict[str, np.ndarray]:
     arrays = {f"tiles.{name}": x for name, x in arrays_of(far.tiles).items()}
     arrays |= {"box": far.box, "border": np.array(far.border), "trails": far.trails,
                "refused": far.refused, "costs.corner": far.costs[0],
-               "costs.edge": np.array(far.costs[1])}  # fmt: skip
+               "costs.edge": np.array(far.costs[1]), "mask.corner": far.mask[0],
+               "mask.edge": np.array(far.mask[1]), "goal": far.goal,
+               "tried": far.tried}  # fmt: skip
     views = far.views
     arrays |= {"views.pose": views.pose, "views.place": views.place, "views.path": views.path}
     arrays |= {f"values.{name}": x for name, x in views.values.items()}
@@ -558,12 +685,13 @@ def far_of(arrays: Mapping[str, np.ndarray], config: MappingConfig, camera: Came
     under = lambda prefix: {
         name.removeprefix(prefix): x for name, x in arrays.items() if name.startswith(prefix)
     }
-    empty = Tiles(lattice_for(config, camera, arrays["box"]), (0, 0, 0), config.capacity)
+    lattice = lattice_for(config, camera, arrays["box"])
     zones = under("zones.")
-    return Far(
-        tiles=with_arrays(empty, under("tiles."), _KINDS),
+    far = Far(
+        tiles=with_arrays(Tiles(lattice, (0, 0, 0), config.capacity), under("tiles."), _KINDS),
         box=arrays["box"],
         border=float(arrays["border"]),
+        coarse=Coarse(lattice),
         views=Views(*(arrays[f"views.{name}"] for name in ("pose", "place", "path")),
                     values=under("values.")),
         trails=arrays["trails"],
@@ -571,6 +699,10 @@ def far_of(arrays: Mapping[str, np.ndarray], config: MappingConfig, camera: Came
         costs=(arrays["costs.corner"], float(arrays["costs.edge"])),
         refused=arrays["refused"],
     )  # fmt: skip
+    if "goal" in arrays:  # not in planners saved by earlier versions
+        mask = arrays["mask.corner"], float(arrays["mask.edge"])
+        far = replace(far, mask=mask, goal=arrays["goal"], tried=arrays["tried"])
+    return with_closed_columns(far)
 
 
 def merged_far(fars: Sequence[Far], tiles: Tiles) -> Far:
@@ -581,11 +713,15 @@ def merged_far(fars: Sequence[Far], tiles: Tiles) -> Far:
         tiles: of all of them.
     """
     first = fars[0]
-    return replace(
+    merged = replace(
         first,
         tiles=tiles,
         views=functools.reduce(_joined, (far.views for far in fars)),
         trails=np.unique(np.concatenate([far.trails for far in fars]), axis=0),
         zones=tuple(zone for far in fars for zone in far.zones),
         refused=np.unique(np.concatenate([far.refused for far in fars]), axis=0),
+        tried=np.concatenate([far.tried for far in fars]),
+        mask=(np.concatenate([far.mask[0] for far in fars]), max(far.mask[1] for far in fars)),
+        coarse=Coarse(first.tiles.lattice),  # filled with the next decision
     )
+    return with_closed_columns(merged)

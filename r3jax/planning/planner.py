@@ -54,6 +54,8 @@ from r3jax.planning.far import (
     moved_to,
     pixel_columns,
     weigh_far,
+    with_closed_columns,
+    with_coarse,
     with_views,
 )
 from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo, PlansAhead, Policy
@@ -128,7 +130,7 @@ def start(
         camera: of the frames; the widest of them.
         bounds: box of the space to explore: lower and upper corner, [2, 3] [m]. None, or infinite
             along some axes: a place of any size, of which what lies round the robot is at hand and
-            all else in tiles (`MappingConfig.tiles`); for r3 and r3-pano.
+            all else in tiles (`MappingConfig.tiles`); for r3, r3-pano, r3-ahead, frontier.
         policy: a policy, or its name (`r3jax policies` lists them).
         starts: initial poses [4, 4] of the cameras. The ball of `config.start_radius` around each
             counts as free, because no depth image shows it. Without a start the robot may be shut
@@ -266,13 +268,14 @@ def _decide_far(
     """Compares views that were left for later with a decision within the block."""
     assert before.far is not None
     policy, here = cast(GreedyPolicy, before.policy), pose[:3, 3]
-    far = arrived(before.far, here)
+    memory = cast(PlannerState, after.policy_state)
+    far = with_coarse(arrived(before.far, here), before.grid, memory, policy.config)
     best, left = weigh_far(far, policy, decision, pose)
     if decision is not None:
         left = with_views(left, decision, here, policy.config.radius)
     if best is not decision and best is not None:
-        # The path to what was at hand is not taken: it leaves no trail.
-        state = replace(after.policy_state, trail=left.trail)
+        # The near view is not taken: its path leaves no trail, and its cells were not viewed.
+        state = replace(memory, trail=left.trail, memory=before.policy_state.memory)
         if info.outcome is not DecisionOutcome.MOVED:
             info = PlanInfo(DecisionOutcome.MOVED, len(best.candidates), len(best.candidates),
                             info.stage_seconds)  # fmt: skip
@@ -327,21 +330,22 @@ def keep_out(planner: Planner, zones: Iterable[Any] | np.ndarray) -> Planner:
 
     Args:
         planner: before.
-        zones: polygons, each with corners [k, 2] in the world [m], k >= 3; or a mask of the grid's
-            columns, [X, Y] bool.
+        zones: polygons, each with corners [k, 2] in the world [m], k >= 3; or a mask of the columns
+            of `planner.grid`, [X, Y] bool. With tiles that grid moves with the robot: the mask
+            closes the columns that it has now, which stay closed wherever the robot goes.
 
     Raises:
         ValueError: not a polygon, or a mask of another shape.
     """
     shape = planner.grid.log_odds.shape
     polygons: list[np.ndarray] = []
-    columns = np.zeros(shape[:2], bool)
+    columns, size = np.zeros(shape[:2], bool), float(planner.grid.cell_size)
+    mask = np.zeros((0, 2))
     if isinstance(zones, np.ndarray) and zones.dtype == bool:
-        if planner.far is not None:
-            raise InputError("a mask has no place in a world of tiles: give polygons")
         if zones.shape != shape[:2]:
             raise InputError(f"the mask must be [X, Y] = {list(shape[:2])}, got {zones.shape}")
         columns = zones
+        mask = np.asarray(planner.grid.origin, np.float64)[:2] + size * np.argwhere(zones)
     else:
         for zone in zones:
             corners = np.asarray(zone, np.float64)
@@ -353,7 +357,8 @@ def keep_out(planner: Planner, zones: Iterable[Any] | np.ndarray) -> Planner:
             columns |= columns_in(planner.grid, corners)
             polygons.append(corners)
     if planner.far is not None:
-        planner = replace(planner, far=replace(planner.far, zones=tuple(polygons)))
+        far = replace(planner.far, zones=tuple(polygons), mask=(mask, size))
+        planner = replace(planner, far=with_closed_columns(far))
     cells = np.broadcast_to(columns[:, :, None], shape)
     return replace(planner, grid=planner.grid.marked(cells, KEEP_OUT))
 
@@ -394,7 +399,8 @@ def with_costmap(
     corners = corner + resolution * np.stack([x, y], axis=1)
     columns = pixel_columns(planner.grid, corners, resolution)
     if planner.far is not None:
-        planner = replace(planner, far=replace(planner.far, costs=(corners, resolution)))
+        far = replace(planner.far, costs=(corners, resolution))
+        planner = replace(planner, far=with_closed_columns(far))
     cells = np.broadcast_to(columns[:, :, None], planner.grid.log_odds.shape)
     return replace(planner, grid=planner.grid.marked(cells, COSTMAP))
 

@@ -61,7 +61,9 @@ def rebuild(
     if far is not None:
         # Trails and views were found on poses that were wrong.
         tiles = replace(far.tiles, voxels=Voxels(), cells={})
-        far = replace(far, tiles=tiles, trails=far.trails[:0], views=NO_VIEWS)
+        coarse = replace(far.coarse, tiles={}, links={})
+        far = replace(far, tiles=tiles, coarse=coarse, trails=far.trails[:0], views=NO_VIEWS,
+                      goal=far.goal[:0], tried=far.tried[:0])  # fmt: skip
     grid = mark_starts(grid, starts, planner.config)
     config = replace(planner.config, capacity=planner.map_state.capacity)
     key = jax.random.key(0) if key is None else key

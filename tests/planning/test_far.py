@@ -10,9 +10,20 @@ import pytest
 
 import r3jax
 from r3jax.errors import InputError, PathError
-from r3jax.mapping.tiles import whole_map
+from r3jax.mapping.tiles import packed_layer, page, unpacked_layer, whole_map
 from r3jax.mapping.update import integrate_growing
-from r3jax.planning.far import Views, arrived, far_arrays, far_of, first_far, weigh_far, with_views
+from r3jax.planning.far import (
+    Views,
+    arrived,
+    far_arrays,
+    far_of,
+    first_far,
+    weigh_far,
+    with_closed_columns,
+    with_coarse,
+    with_views,
+)
+from r3jax.planning.far_paths import Coarse
 from r3jax.planning.planner import at_hand, first_map
 from r3jax.planning.policy import Decision
 from tests.mapping.test_tiles import assert_same_map
@@ -45,6 +56,35 @@ def way(*corners):
     return np.concatenate(cells)
 
 
+def known(far, free):
+    """The same with free cells [n, 3], all of them far away, and matter around."""
+    cells, around = {}, np.array(list(itertools.product((-1, 0, 1), repeat=3)))
+    lattice = far.tiles.lattice
+    for values, found in ((3.0, free[:, None] + around), (-3.0, free)):
+        for cell in np.reshape(found, (-1, 3)).astype(int):
+            tile, local = np.divmod(cell, lattice.cells)
+            odds = cells.setdefault(tuple(tile.tolist()), np.zeros(lattice.cells, np.float32))
+            odds[tuple(local)] = values
+    packed = {tile: {"log_odds": packed_layer(odds)} for tile, odds in cells.items()}
+    return updated(replace(far, tiles=replace(far.tiles, cells=packed)))
+
+
+def updated(far, log_odds=None, policy=None):
+    """The same with an up-to-date coarse level; of the block nothing is known, unless given."""
+    policy = policy or a_policy()
+    if log_odds is None:
+        log_odds = np.zeros(far.tiles.lattice.shape, np.float32)
+    grid = far.grid(log_odds)
+    memory = policy.init(CAMERA, grid, key=KEY)
+    return with_coarse(far, grid, memory, policy.config)
+
+
+def on_trail(far, cells):
+    """A robot far away from the block that has come through known cells [n, 3]."""
+    far = replace(far, tiles=replace(far.tiles, middle=(0, 0, 9)), trails=cells)
+    return known(far, cells)
+
+
 def a_view(position, place, path, utility):
     pose = np.eye(4)[None].copy()
     pose[0, :3, 3] = position
@@ -53,8 +93,7 @@ def a_view(position, place, path, utility):
 
 def test_a_view_left_far_away_is_gone_back_to_over_the_way_that_was_come():
     """Round a corner: 200 cells out, 100 to the side; nothing is left here."""
-    far = far_at([0.1, 0.1, 0.1])
-    far = replace(far, trails=way((0, 0, 0), (200, 0, 0), (200, 100, 0)))
+    far = on_trail(far_at([0.1, 0.1, 0.1]), way((0, 0, 0), (200, 0, 0), (200, 100, 0)))
     place = (np.array([200, 100, 0]) + 0.5) * 0.25
     far = replace(far, views=a_view(place + np.array([0.0, 2.0, 0.0]), place, 2.0, 50.0))
     here = np.eye(4)
@@ -66,12 +105,14 @@ def test_a_view_left_far_away_is_gone_back_to_over_the_way_that_was_come():
     np.testing.assert_allclose(decision.T_world_camera[:3, 3], place)
     assert decision.length == pytest.approx(300 * 0.25, rel=0.02)  # the corner is cut by one cell
     assert len(decision.waypoints) <= 5
-    assert len(after.views.path) == 0  # a promise is taken once
+    there = arrived(after, place)
+    assert len(after.views.path) == 1
+    assert len(there.views.path) == 0  # a promise is taken once
 
 
-@pytest.mark.parametrize("kind", ["zone", "costmap", "refused"])
+@pytest.mark.parametrize("kind", ["zone", "costmap", "mask", "refused"])
 def test_no_path_leads_through_what_was_closed_since(kind):
-    far = replace(far_at([0.1, 0.1, 0.1]), trails=way((0, 0, 0), (200, 0, 0)))
+    far = on_trail(far_at([0.1, 0.1, 0.1]), way((0, 0, 0), (200, 0, 0)))
     place = np.array([200.5, 0.5, 0.5]) * 0.25
     far = replace(far, views=a_view(place, place, 0.0, 50.0))
     here = np.eye(4)
@@ -80,16 +121,18 @@ def test_no_path_leads_through_what_was_closed_since(kind):
     closed = {
         "zone": {"zones": (np.array([[20.0, -1.0], [21.0, -1.0], [21.0, 1.0], [20.0, 1.0]]),)},
         "costmap": {"costs": (np.array([[20.0, 0.0]]), 0.3)},
+        "mask": {"mask": (np.array([[20.0, 0.0]]), 0.25)},
         "refused": {"refused": np.array([[*place, 0.5]])},
     }
-    assert weigh_far(replace(far, **closed[kind]), a_policy(), None, here)[0] is None
+    after = updated(with_closed_columns(replace(far, **closed[kind])))
+    assert weigh_far(after, a_policy(), None, here)[0] is None
 
 
 def test_a_view_without_a_way_is_no_goal():
-    far = far_at([0.1, 0.1, 0.1])
     cells = np.concatenate([way((0, 0, 0), (9, 0, 0)), way((100, 0, 0), (200, 0, 0))])
+    far = on_trail(far_at([0.1, 0.1, 0.1]), cells)
     place = np.array([200.5, 0.5, 0.5]) * 0.25
-    far = replace(far, trails=cells, views=a_view(place, place, 0.0, 50.0))
+    far = replace(far, views=a_view(place, place, 0.0, 50.0))
     here = np.eye(4)
     here[:3, 3] = 0.125
     assert weigh_far(far, a_policy(), None, here) == (None, far)
@@ -97,7 +140,7 @@ def test_a_view_without_a_way_is_no_goal():
 
 @pytest.mark.parametrize(("promise", "goes"), [(5.0, False), (500.0, True)])
 def test_near_and_far_views_are_weighed_together(promise, goes):
-    far = replace(far_at([0.1, 0.1, 0.1]), trails=way((0, 0, 0), (80, 0, 0)))
+    far = on_trail(far_at([0.1, 0.1, 0.1]), way((0, 0, 0), (80, 0, 0)))
     place = np.array([80.5, 0.5, 0.5]) * 0.25
     far = replace(far, views=a_view(place, place, 0.0, promise))
     near = Decision(
@@ -159,7 +202,7 @@ def test_limits_zones_and_refusals_are_drawn_into_every_block():
 
 
 def test_other_policies_and_positions_are_refused():
-    for name in ("frontier", "r3-ahead", "random"):
+    for name in ("active-gs", "random"):
         with pytest.raises(InputError, match=name):
             r3jax.start(CAMERA, policy=name)
     with pytest.raises(InputError, match="bounds"):
@@ -169,8 +212,155 @@ def test_other_policies_and_positions_are_refused():
         at_hand(planner, np.array([500_000.0, 5_600_000.0, 100.0]))  # UTM
     with pytest.raises(InputError, match=r"tile_folder.*bounds"):
         r3jax.start(CAMERA, HALL, a_policy(), tile_folder="unused")
-    with pytest.raises(InputError, match="polygons"):
-        r3jax.keep_out(planner, np.zeros(planner.grid.log_odds.shape[:2], bool))
+
+
+def a_box(low, high):
+    """All cells from one to another, [n, 3]."""
+    ranges = (np.arange(a, b + 1) for a, b in zip(low, high, strict=True))
+    return np.stack(np.meshgrid(*ranges, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def at_cell(*cell):
+    pose = np.eye(4)
+    pose[:3, 3] = (np.array(cell) + 0.5) * 0.25
+    return pose
+
+
+def test_a_frontier_far_away_is_a_goal_though_no_view_of_it_was_scored():
+    """A corridor whose far end is not known."""
+    far = replace(far_at([0.1, 0.1, 0.1]), trails=np.array([[2, 2, 2]]))
+    far = replace(far, tiles=replace(far.tiles, middle=(0, 0, 9)))
+    free = a_box((0, 0, 0), (200, 4, 4))
+    far = known(far, np.concatenate([free, a_box((201, -1, -1), (202, 5, 5))]))
+    cells = {tile: dict(layers) for tile, layers in far.tiles.cells.items()}
+    (tile, local), size = np.divmod([201, 2, 2], far.tiles.lattice.cells), far.tiles.lattice.cells
+    odds = np.array(unpacked_layer(cells[tuple(tile)]["log_odds"], size))
+    odds[local[0] :] = 0.0
+    cells[tuple(tile.tolist())] = {"log_odds": packed_layer(odds)}
+    cells = {t: x for t, x in cells.items() if t[0] <= tile[0]}
+    far = replace(far, tiles=replace(far.tiles, cells=cells), coarse=Coarse(far.tiles.lattice))
+    far = updated(far)
+    here = at_cell(2, 2, 2)
+    decision, after = weigh_far(far, a_policy(), None, here)
+    assert decision is not None
+    end = decision.waypoints[-1]
+    assert 201 * 0.25 - 2.5 < end[0] < 201 * 0.25
+    assert decision.length == pytest.approx(np.linalg.norm(end - here[:3, 3]), rel=0.05)
+    assert weigh_far(arrived(after, end), a_policy(), None, here)[0] is None  # it is tried once
+
+
+def the_ring():
+    """Two corridors of 20 m side by side, joined at both ends; the robot came through one."""
+    far = replace(far_at([0.1, 0.1, 0.1]), trails=way((2, 2, 2), (2, 22, 2), (82, 22, 2)))
+    far = replace(far, tiles=replace(far.tiles, middle=(0, 0, 9)))
+    boxes = [((0, 0, 0), (84, 4, 4)), ((0, 20, 0), (84, 24, 4)),
+             ((0, 0, 0), (4, 24, 4)), ((80, 0, 0), (84, 24, 4))]  # fmt: skip
+    return known(far, np.concatenate([a_box(*box) for box in boxes]))
+
+
+def test_a_path_takes_a_shortcut_that_was_seen_and_never_traveled():
+    far = the_ring()
+    place = at_cell(82, 22, 2)[:3, 3]
+    far = replace(far, views=a_view(place, place, 0.0, 50.0))
+    decision, _ = weigh_far(far, a_policy(), None, at_cell(82, 2, 2))
+    assert decision is not None
+    assert decision.length == pytest.approx(20 * 0.25, rel=0.1)  # over the trail it is 45 m
+    np.testing.assert_allclose(decision.waypoints[-1], place)
+
+
+def test_a_robot_whose_path_turns_out_blocked_takes_another_to_the_same_goal():
+    far, policy = the_ring(), a_policy()
+    place = at_cell(2, 22, 2)[:3, 3]
+    far = replace(far, views=a_view(place, place, 0.0, 50.0), trails=far.trails[:60])
+    first, far = weigh_far(far, policy, None, at_cell(30, 2, 2))
+    assert first is not None
+    assert first.length < 14.0
+    # On its way it has moved on, and sees what has closed the corridor ahead.
+    here = at_cell(12, 2, 2)
+    state = first_map(CONFIG)
+    layers = {"log_odds": np.zeros(far.tiles.lattice.shape, np.float32),
+              "looks": np.zeros(far.tiles.lattice.shape, np.int32)}  # fmt: skip
+    _, layers, tiles = page(state, layers, far.tiles, here[:3, 3])
+    far = replace(far, tiles=tiles)
+    odds, low = np.array(layers["log_odds"]), np.array([8, 0, 0]) - far.first_cell
+    odds[low[0], low[1] : low[1] + 5, low[2] : low[2] + 5] = 3.0
+    far = updated(arrived(far, here[:3, 3]), odds)
+    second, _ = weigh_far(far, policy, None, here)
+    assert second is not None
+    np.testing.assert_allclose(second.waypoints[-1], place)
+    assert second.length > 35.0
+    assert not np.any(np.all(np.abs(second.waypoints - at_cell(8, 2, 2)[:3, 3]) < 0.6, axis=1))
+
+
+def test_what_no_path_within_the_block_joins_is_gone_to_round_it():
+    """At hand, behind a wall; the end of the wall is not at hand."""
+    far = the_ring()
+    place = at_cell(2, 22, 2)[:3, 3]
+    far = replace(far, views=a_view(place, place, 0.0, 50.0))
+    wall = a_box((0, 10, 0), (4, 10, 4))
+    here = at_cell(2, 2, 2)
+    layers = {"log_odds": np.zeros(far.tiles.lattice.shape, np.float32)}
+    _, layers, tiles = page(first_map(CONFIG), layers, far.tiles, here[:3, 3])
+    far = replace(far, tiles=tiles, trails=far.trails[:1])
+    odds = np.array(layers["log_odds"])
+    assert weigh_far(updated(far, odds), a_policy(), None, here)[0] is None
+    odds[tuple((wall - far.first_cell).T)] = 3.0
+    decision, _ = weigh_far(updated(far, odds), a_policy(), None, here)
+    assert decision is not None
+    assert decision.length > 35.0
+
+
+def test_policies_weigh_what_is_far_by_their_own_rules():
+    far = {"utility": np.array([80.0]), "path": np.array([4.0])}
+    ahead = a_policy("r3-ahead")
+    near = {"utility": np.array([9.0]), "ahead": np.array([3.0]), "path": np.array([1.0])}
+    assert ahead.weigh_far(near, far).tolist() == [3.0, 80.0 / (4.0 + 4.0)]
+    frontier = a_policy("frontier")
+    assert frontier.weigh_far({"path": np.array([9.0])}, far).tolist() == [-9.0, -4.0]
+    near = {"path": np.array([0.3]), "lot": np.array([0.9])}
+    assert frontier.weigh_far(near, far).tolist() == [-np.inf, -4.0]
+    assert frontier.weigh_far({}, far).tolist() == [-4.0]
+
+
+def test_a_mask_closes_the_columns_that_the_grid_has_now():
+    planner = r3jax.start(CAMERA, policy=a_policy(), config=CONFIG)
+    mask = np.zeros(planner.grid.log_odds.shape[:2], bool)
+    mask[7, 9:12] = True
+    planner = r3jax.keep_out(planner, mask)
+    np.testing.assert_array_equal(np.asarray(planner.grid.closed).any(axis=2), mask)
+    place = np.asarray(planner.grid.origin)[:2] + (np.array([7, 10]) + 0.5) * 0.25
+    moved = at_hand(planner, np.array([2.0, 0.0, 0.0]))
+    cell = np.floor((place - np.asarray(moved.grid.origin)[:2]) / 0.25).astype(int)
+    assert np.asarray(moved.grid.closed)[tuple(cell)].all()
+    assert np.asarray(moved.grid.closed).any(axis=2).sum() == 3
+
+
+def test_cells_that_frontier_has_viewed_move_with_the_tiles():
+    planner = r3jax.start(CAMERA, policy=a_policy("frontier"), config=CONFIG)
+    viewed = np.random.default_rng(0).random(planner.grid.log_odds.shape) < 0.1
+    planner = replace(planner, policy_state=replace(planner.policy_state, memory=viewed))
+    away = at_hand(planner, np.array([50.0, 9.0, 0.0]))
+    assert not away.policy_state.memory.any()
+    back = at_hand(away, np.array([0.1, 0.1, 0.1]))
+    np.testing.assert_array_equal(back.policy_state.memory, viewed)
+
+
+@pytest.mark.full
+def test_r3_ahead_explores_a_hall_to_its_end_by_tiles():
+    name, settings = "r3-ahead", {"beam": 2, "branching": 3, "horizon": 2}
+    pose, farthest = pose_at([2.0, 2.0, 1.3], 0.0, 0.0), 0.0
+    planner = r3jax.start(CAMERA, policy=a_policy(name, **settings), starts=[pose], config=CONFIG)
+    for step in range(30):
+        frame = frame_in_room(CAMERA, pose, room=HALL, noise=0.002, seed=step)
+        planner = r3jax.observe(
+            planner, r3jax.Frame.from_arrays(frame.rgb, frame.depth, pose, CAMERA)
+        )
+        decision, planner, info = r3jax.decide(planner, pose, jax.random.fold_in(KEY, step))
+        assert decision is not None, info.reason
+        pose = decision.T_world_camera
+        assert np.all(pose[:3, 3] > HALL[0]) and np.all(pose[:3, 3] < HALL[1])  # noqa: PT018
+        farthest = max(farthest, pose[0, 3])
+    assert farthest > 12.0
 
 
 @pytest.mark.full

@@ -46,6 +46,7 @@ class Frontier(GreedyPolicy):
 
     name = "frontier"
     source = "Yamauchi, CIRA 1997: the nearest frontier"
+    memory_by_cell = True
 
     def first_memory(self, camera: Camera, grid: OccupancyGrid) -> np.ndarray:
         """Returns the frontier cells viewed so far, [X, Y, Z] bool: none."""
@@ -87,6 +88,11 @@ class Frontier(GreedyPolicy):
     def weigh(self, utilities: dict[str, np.ndarray]) -> np.ndarray:
         """Returns the negative path length, or random scores."""
         return utilities.get("lot", -utilities["path"])
+
+    def weigh_far(self, near: dict[str, np.ndarray], far: dict[str, np.ndarray]) -> np.ndarray:
+        """Returns the negative path lengths; random views only count without any frontier."""
+        own = -near["path"] if near else np.zeros(0)
+        return np.concatenate([np.full_like(own, -np.inf) if "lot" in near else own, -far["path"]])
 
     def conclude(
         self,

@@ -176,6 +176,12 @@ class R3Ahead(GreedyPolicy):
         """Returns the rate of the best path, which already includes the path."""
         return utilities["ahead"]
 
+    def weigh_far(self, near: dict[str, np.ndarray], far: dict[str, np.ndarray]) -> np.ndarray:
+        """Returns the rates of paths; of a goal far away, that of its view alone."""
+        seconds = far["path"] / (self.config.motion.speed or SPEED) + self.config.view_seconds
+        rate = far["utility"] / np.maximum(seconds, 1e-9)
+        return np.concatenate([self.weigh(near) if near else np.zeros(0), rate])
+
 
 @dataclass(frozen=True)
 class Path:

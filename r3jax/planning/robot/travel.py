@@ -288,19 +288,13 @@ def plan_travel(
         raise InputError(f"the position must be three finite numbers [m], got {start}")
     check_height(float(start[2]), heights)
     if room is None:
-        safe = safe_cells(free, cell_size, safety_margin)
+        occupied = np.asarray(grid.occupied) if body > 0.0 else None
+        safe = cells_for_ball(free, occupied, origin[2], cell_size, safety_margin, heights, body)
     else:
         safe = np.repeat(room.columns[:, :, None], free.shape[2], axis=2)
+        _close_layers(safe, heights, origin[2], cell_size)
     if grid.closed is not None:
         safe &= ~grid.closed
-    if heights != UNLIMITED:
-        first, last = layers_between(heights, origin[2], cell_size, free.shape[2])
-        # Closed layers, not clipped paths: the search itself must stay within the heights.
-        safe[:, :, : max(first, 0)] = False
-        safe[:, :, last + 1 :] = False
-    if room is None and body > 0.0:
-        occupied = np.asarray(grid.occupied)
-        safe &= ~cells_over_matter(occupied, body, safety_margin, heights, origin[2], cell_size)
     cell = tuple(int(i) for i in np.floor((start - origin) / cell_size))
     is_inside = all(0 <= i < n for i, n in zip(cell, free.shape, strict=True))
     usable = safe
@@ -354,6 +348,44 @@ def fresh_columns(travel: Travel, trail: np.ndarray, places: np.ndarray) -> np.n
         square = np.ones((3, 3), bool) if i % 2 else None
         near = np.asarray(ndimage.binary_dilation(near, square, mask=is_open), bool)
     return is_open & ~near
+
+
+def cells_for_ball(
+    free: np.ndarray,
+    occupied: np.ndarray | None,
+    origin: float,
+    cell_size: float,
+    margin: float,
+    heights: tuple[float, float] = UNLIMITED,
+    body: float = 0.0,
+) -> np.ndarray:
+    """Finds cells in which a flying camera may be: `safe_cells` within its heights.
+
+    Args:
+        free: cells known to be free, [X, Y, Z] bool.
+        occupied: cells known to be occupied, [X, Y, Z] bool; only read if there is a body.
+        origin: height of the lowest cell's lower face [m].
+        cell_size: edge of a cell [m].
+        margin: radius of the ball that must be free [m].
+        heights: lowest and highest camera position [m].
+        body: length of the robot below the camera [m] (`cells_over_matter`).
+    """
+    safe = safe_cells(free, cell_size, margin)
+    _close_layers(safe, heights, origin, cell_size)
+    if body > 0.0 and occupied is not None:
+        safe &= ~cells_over_matter(occupied, body, margin, heights, origin, cell_size)
+    return safe
+
+
+def _close_layers(
+    safe: np.ndarray, heights: tuple[float, float], origin: float, cell_size: float
+) -> None:
+    """Closes the layers of cells out of a range of heights, in place."""
+    if heights != UNLIMITED:
+        first, last = layers_between(heights, origin, cell_size, safe.shape[2])
+        # Closed layers, not clipped paths: the search itself must stay within the heights.
+        safe[:, :, : max(first, 0)] = False
+        safe[:, :, last + 1 :] = False
 
 
 def safe_cells(free: np.ndarray, cell_size: float, margin: float) -> np.ndarray:
