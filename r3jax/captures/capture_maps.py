@@ -47,6 +47,11 @@ _MOST_ROWS = 1 << 22
 _SPARSE_REACH = 1.1
 """Without depth images, an image sees this many times as far as its farthest point."""
 
+
+class TooManyVoxelsError(InputError):
+    """A capture of more voxels than fit into memory in all folds."""
+
+
 OnFrame = Callable[[], None]
 """Callback after each image; each image is processed twice."""
 
@@ -226,7 +231,7 @@ def grown(state: MapState, frame: Frame, drop_edges: bool, max_range: float = RA
     try:
         return update_growing(lambda now: _add_pixels(now, *arguments), state, _MOST_ROWS)
     except ValueError as error:
-        raise InputError(
+        raise TooManyVoxelsError(
             f"the capture fills more than {_MOST_ROWS} voxels: choose a larger --voxel-size"
         ) from error
 

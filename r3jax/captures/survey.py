@@ -16,7 +16,7 @@ Shape symbols: n poses; k depths or points.
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -125,7 +125,7 @@ _DENSE_VOXEL, _SPARSE_VOXEL, _CELL = 0.05, 0.1, 0.2
 _MOST_ACROSS = INDEX_LIMIT // 2
 """Voxels along an axis: an index has 21 bits."""
 
-_LARGEST_VOXEL = 0.2 * RANGE
+LARGEST_VOXEL = 0.2 * RANGE
 """Maximum voxel size that separates one wall from the next [audit units]."""
 
 _PIXELS = 3.0
@@ -189,6 +189,12 @@ class Survey:
     def is_one_place(self) -> bool:
         """True if surfaces were seen from one direction each: a tripod, a panorama head."""
         return self.span < _ONE_PLACE * self.median_depth
+
+    def with_voxels(self, size: float) -> "Survey":
+        """Returns the survey with another voxel size [audit units], and cells that fit it."""
+        cell = max(self.cell_size, 2.0 * size)
+        bounds = on_lattice(self.bounds, cell)
+        return replace(self, voxel_size=size, cell_size=cell, bounds=bounds)
 
     def length(self, in_audit: float) -> float:
         """Converts a length of the audit to the capture's units."""
@@ -349,7 +355,7 @@ def _check_voxel(voxel: float, bounds: np.ndarray, scale: float) -> None:
             f"voxels of {voxel / scale:.3g} would be {across:.3g} voxels along an axis: choose a "
             "larger --voxel-size"
         )
-    if voxel > _LARGEST_VOXEL:
+    if voxel > LARGEST_VOXEL:
         raise InputError(
             f"voxels of {voxel / scale:.3g} are larger than a fifth of the range "
             f"({RANGE / scale:.3g}): choose a smaller --voxel-size"
@@ -361,7 +367,7 @@ def _voxel_size(source: Source, settings: SurveySettings, scale: float, median: 
         return settings.voxel_size * scale
     focal = float(np.median([float(source.camera(i).focal) for i in _few(len(source))]))
     finest = _DENSE_VOXEL if source.is_dense else _SPARSE_VOXEL
-    return min(max(finest, _PIXELS * median * scale / focal), _LARGEST_VOXEL)
+    return min(max(finest, _PIXELS * median * scale / focal), LARGEST_VOXEL)
 
 
 def _few(count: int) -> list[int]:

@@ -320,7 +320,8 @@ def _visible(
     def seen_from(position: Float[Array, " 3"]) -> Bool[Array, " N"]:
         return visible_rows(voxels, panorama_view(position, config), config)
 
-    return jax.vmap(seen_from)(positions)
+    # One after another: together they would take a kilobyte for each row of the map.
+    return jax.lax.map(seen_from, positions)
 
 
 def score_from_standpoints(
@@ -335,10 +336,18 @@ def score_from_standpoints(
         config: settings of the closed forms.
     """
     # Indices of the standpoints as floats, because `map_over_devices` distributes floats.
-    ids = jnp.arange(demand.position.shape[0], dtype=jnp.float32)
+    ids = np.arange(demand.position.shape[0], dtype=np.float32)
     part = functools.partial(_answers, state, demand, focal, config)
-    value, terms, costs = map_over_devices(part, ids)
-    return StandpointScores(value, jnp.sum(terms, axis=0), jnp.sum(costs, axis=0))
+    values, terms, costs = list[Array](), jnp.zeros(()), jnp.zeros(())
+    for some in np.split(ids, np.arange(_AT_ONCE, len(ids), _AT_ONCE)):
+        value, of_terms, of_costs = map_over_devices(part, jnp.asarray(some))
+        values.append(value)
+        terms, costs = terms + jnp.sum(of_terms, axis=0), costs + jnp.sum(of_costs, axis=0)
+    return StandpointScores(jnp.concatenate(values), terms, costs)
+
+
+_AT_ONCE = 4
+"""Standpoints whose terms are summed at once: those of all would take 600 bytes a row."""
 
 
 @jax.jit
@@ -388,7 +397,7 @@ def diagnose(state: MapState, demand: Demand, answers: StandpointScores) -> Diag
     count = np.asarray(demand.num_seen)
     value = np.asarray(jnp.sum(answers.value, axis=0)) / np.maximum(count, 1.0)
     bias, noise, resolution = np.asarray(answers.terms) / np.maximum(count, 1.0)
-    directions = np.bitwise_count(np.asarray(state.visited)).sum(axis=0).astype(np.int64)
+    directions = np.bitwise_count(np.asarray(state.visited)).sum(axis=0).astype(np.int16)
     return Diagnosis(
         num_seen=count,
         value=value,
@@ -414,7 +423,7 @@ def cause_of(value: np.ndarray, costs: np.ndarray, count: np.ndarray) -> np.ndar
     of_bias = np.where(count < FEW, CAUSES.index("rare"), CAUSES.index("angle"))
     of_others = np.where(dearest == 1, CAUSES.index("noise"), CAUSES.index("distance"))
     found = np.where(dearest == 0, of_bias, of_others)
-    return np.where(value >= FINE, CAUSES.index("fine"), found)
+    return np.where(value >= FINE, CAUSES.index("fine"), found).astype(np.int8)
 
 
 BLOCK = 1.0

@@ -357,27 +357,30 @@ def suggest(
     key = jax.random.key(seed)
     memory = greedy.init(task.camera, grid, key=key)
     planner = Planner(state, grid, memory, greedy, MappingConfig())
-    diagnoses, taken, here = list[Diagnosis](), list[_Taken](), np.eye(4)
+    views, here = list[Suggestion](), np.eye(4)
+    before: Diagnosis | None = None
+    # Of the diagnoses only the last one is kept: each takes as much memory as a map.
+    last: tuple[_Taken, Diagnosis] | None = None
     for _ in range(num):
         decision, planner, _ = decide(planner, here, key)
         if decision is None:
             break
-        diagnoses.append(planner.policy_state.diagnosis)
+        now: Diagnosis = planner.policy_state.diagnosis
+        before = now if before is None else before
+        if last is not None:
+            views.append(_suggestion(len(views) + 1, *last, now, places))
         planner, view = _imagine(planner, task, decision)
-        taken.append(view)
+        last = view, now
         here = decision.T_world_camera
         on_view()
-    diagnoses.append(task.evaluate(planner.map_state)[1])
-    steps = zip(taken, diagnoses[:-1], diagnoses[1:], strict=True)
-    views = [
-        _suggestion(rank, view, now, after, places)
-        for rank, (view, now, after) in enumerate(steps, start=1)
-    ]
+    after = task.evaluate(planner.map_state)[1]
+    if last is not None:
+        views.append(_suggestion(len(views) + 1, *last, after, places))
     drawn = _random(state, task, places.eyes, len(views), seed)
-    means, shares = (tuple(getattr(d, name) for d in drawn) for name in ("mean", "fine_share"))
+    means, shares = (tuple(values) for values in zip(*drawn, strict=True)) if drawn else ((), ())
     eyes = np.array([view.pose[:3, 3] for view in views]).reshape(-1, 3)
     walk = tuple(views[i] for i in walking_order(eyes, start))
-    return SuggestedViews(walk, diagnoses[0], diagnoses[-1], means, shares)
+    return SuggestedViews(walk, after if before is None else before, after, means, shares)
 
 
 def walking_order(eyes: np.ndarray, start: np.ndarray) -> list[int]:
@@ -499,13 +502,14 @@ def random_poses(places: np.ndarray, num: int, seed: int) -> np.ndarray:
 
 def _random(
     state: MapState, task: Task, places: np.ndarray, num: int, seed: int
-) -> list[Diagnosis]:
-    """Diagnoses the map after each of `num` random views."""
-    found: list[Diagnosis] = []
+) -> list[tuple[float, float]]:
+    """Computes mean renderability and share of fine surfaces after each of `num` random views."""
+    found: list[tuple[float, float]] = []
     for pose in random_poses(places, num, seed) if num else _NO_POSES:
         T = jnp.asarray(pose, dtype=jnp.float32)
         state, _ = simulate_view(state, task.camera, T, task.config)
-        found.append(task.evaluate(state)[1])
+        diagnosis = task.evaluate(state)[1]
+        found.append((diagnosis.mean, diagnosis.fine_share))
     return found
 
 

@@ -12,7 +12,6 @@ projected into the other; if the depth there agrees, both show it.
 Shape symbols: n frames; H, W image size; h, w blocks of an image; b blocks in a row; m matches.
 """
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -73,7 +72,7 @@ class BlockImage:
         known = self.depth[np.isfinite(self.depth)]
         return float(np.median(known)) if len(known) else float("nan")
 
-    @functools.cached_property  # each image is compared with about ten others
+    @property
     def points(self) -> np.ndarray:
         """What the middle of each block shows, [b, 3] float64 in the world; NaN without depth."""
         height, width = self.shape
@@ -218,22 +217,40 @@ def neighbor_pairs(images: Sequence[BlockImage]) -> np.ndarray:
     return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
 
 
-def overlap(images: Sequence[BlockImage], first: int, second: int) -> Overlap:
-    """Projects the blocks of one frame into another one."""
+def overlap(
+    images: Sequence[BlockImage], first: int, second: int, points: np.ndarray | None = None
+) -> Overlap:
+    """Projects the blocks of one frame into another one.
+
+    Args:
+        images: the frames.
+        first: the one frame.
+        second: the other one.
+        points: `points` of the first, if they are known.
+    """
     seen = images[second]
-    found = projected(seen.camera, seen.pose, images[first].points)
+    found = projected(seen.camera, seen.pose, images[first].points if points is None else points)
     own = np.flatnonzero(found.is_in)
     row, column = (side[own].astype(np.int64) for side in (found.row, found.column))
     other = row * seen.camera.width + column
     ratio = found.z[own] / seen.depth[other]
     known = np.isfinite(ratio)
-    return Overlap(first, second, own[known], other[known], ratio[known])
+    # As short as they can be: of 5,000 frames there are a hundred million matches.
+    own, other = (x[known].astype(np.int32) for x in (own, other))
+    return Overlap(first, second, own, other, ratio[known].astype(np.float32))
 
 
 def overlaps(images: Sequence[BlockImage]) -> list[Overlap]:
     """Lists the pairs of neighbors with enough in common to be compared, each in one order."""
-    found = [overlap(images, *pair) for pair in neighbor_pairs(images).tolist()]
-    return [pair for pair in found if len(pair.own) >= FEWEST]
+    found: list[Overlap] = []
+    points, of = np.zeros((0, 3)), -1
+    for first, second in neighbor_pairs(images).tolist():
+        if first != of:  # pairs are sorted: the points of one frame are needed at a time
+            points, of = images[first].points, first
+        pair = overlap(images, first, second, points)
+        if len(pair.own) >= FEWEST:
+            found.append(pair)
+    return found
 
 
 def levels(count: int, pairs: np.ndarray, difference: np.ndarray, weight: np.ndarray) -> np.ndarray:

@@ -24,8 +24,10 @@ residual is chosen.
 Shape symbols: n frames; m matches of a pair; b blocks.
 """
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -124,18 +126,46 @@ class Offsets:
     """What all frames have wrong; None: nothing, or not known, as where the camera only turned."""
 
 
+_AT_HAND = 256
+"""Frames whose surfaces are kept: neighbors are mostly those shortly before and after."""
+
+
+class _Surface(NamedTuple):
+    """What a frame shows, in units of the typical depth."""
+
+    points: np.ndarray
+    """[b, 3]."""
+
+    normals: np.ndarray
+    """[b, 3]; NaN at edges."""
+
+    pose: np.ndarray
+    """`T_world_camera`, [4, 4] [capture units]."""
+
+    unit: float
+    """Typical depth [capture units]."""
+
+    @property
+    def center(self) -> np.ndarray:
+        """Position of the camera, [3]."""
+        return self.pose[:3, 3] / self.unit
+
+    def moves(self, blocks: np.ndarray) -> np.ndarray:
+        """Computes the moves of some blocks by what all frames may have wrong, [5, m, 3]."""
+        return _shared(self.points[blocks] - self.center, self.pose[:3, :3])
+
+
 def offsets(images: Sequence[BlockImage], pairs: Sequence[Overlap]) -> Offsets:
     """Aligns all frames by a small motion each."""
     count = len(images)
     unit = float(np.median([d for d in (image.median_depth for image in images) if d > 0.0] or [1]))
-    points = [image.points / unit for image in images]
-    normals = [_normals(p, image.shape) for p, image in zip(points, images, strict=True)]
-    centers = [image.pose[:3, 3] / unit for image in images]
-    shared = [
-        _shared(p - c, image.pose[:3, :3])
-        for p, c, image in zip(points, centers, images, strict=True)
-    ]
-    found = [_matched(pair, points, normals, centers, shared) for pair in pairs]
+
+    @functools.lru_cache(maxsize=_AT_HAND)
+    def surface(i: int) -> _Surface:
+        points = images[i].points / unit
+        return _Surface(points, _normals(points, images[i].shape), images[i].pose, unit)
+
+    found = [_matched(pair, surface(pair.first), surface(pair.second)) for pair in pairs]
     matches = [match for match in found if len(match.error) >= FEWEST]
     if not matches:
         unknown = np.full(count, np.nan)
@@ -145,8 +175,10 @@ def offsets(images: Sequence[BlockImage], pairs: Sequence[Overlap]) -> Offsets:
     distance = np.full(count, np.nan)
     for i, near in enumerate(neighbors_of(count, linked)):
         if len(near):
-            own = points[i][np.isfinite(points[i][:, 0])]
-            moved = [_moved(motion[j], own - centers[j]) for j in (i, *near.tolist())]
+            own = surface(i).points
+            own = own[np.isfinite(own[:, 0])]
+            centers = {j: images[j].pose[:3, 3] / unit for j in (i, *near.tolist())}
+            moved = [_moved(motion[j], own - center) for j, center in centers.items()]
             beside = moved[0] - np.median(moved[1:], axis=0)
             distance[i] = unit * float(np.median(np.linalg.norm(beside, axis=1)))
     typical = float(np.median(np.abs(np.concatenate([match.error for match in matches]))))
@@ -200,28 +232,26 @@ def _shared(offset: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     return np.stack([offset, -aside, -z * rotation[:, 0], -z * rotation[:, 1], -shorter * offset])
 
 
-def _matched(
-    pair: Overlap,
-    points: list[np.ndarray],
-    normals: list[np.ndarray],
-    centers: list[np.ndarray],
-    shared: list[np.ndarray],
-) -> _Matches:
+def _matched(pair: Overlap, first: _Surface, second: _Surface) -> _Matches:
     """Builds the equations of one pair."""
     is_near = np.abs(pair.ratio - 1.0) < _GATE
     own, other = pair.own[is_near], pair.other[is_near]
-    normal = normals[pair.second][other]
+    normal = second.normals[other]
     # NaN where either has no normal.
-    flat = np.flatnonzero(np.einsum("ij,ij->i", normal, normals[pair.first][own]) > _PARALLEL)
+    flat = np.flatnonzero(np.einsum("ij,ij->i", normal, first.normals[own]) > _PARALLEL)
     flat = flat[:: max(1, -(-len(flat) // _MATCHES))]
     own, other, normal = own[flat], other[flat], normal[flat]
-    p, q = points[pair.first][own], points[pair.second][other]
-    turn = lambda x, i: np.cross(x - centers[i], normal)
-    rows = np.concatenate([normal, turn(p, pair.first), -normal, -turn(q, pair.second)], axis=1)
+    p, q = first.points[own], second.points[other]
+    turn = lambda x, center: np.cross(x - center, normal)
+    rows = [normal, turn(p, first.center), -normal, -turn(q, second.center)]
     along = lambda x: np.einsum("ij,ij->i", normal, x)
-    moves = shared[pair.first][:, own] - shared[pair.second][:, other]
+    moves = first.moves(own) - second.moves(other)
     return _Matches(
-        pair.first, pair.second, rows, np.einsum("kij,ij->ik", moves, normal), along(p - q)
+        pair.first,
+        pair.second,
+        np.concatenate(rows, axis=1),
+        np.einsum("kij,ij->ik", moves, normal),
+        along(p - q),
     )
 
 
