@@ -93,6 +93,8 @@ class Node:
     """A node whose callbacks the test calls."""
 
     parameters: dict[str, Any] = {}  # noqa: RUF012
+    time = 0
+    """Of its clock [ns]."""
 
     def __init__(self, name: str):
         self.callbacks: dict[str, Any] = {}
@@ -125,11 +127,12 @@ class Node:
 
     def get_logger(self):
         say = lambda text, **options: self.said.append(text)
-        return SimpleNamespace(info=say, warning=say)
+        return SimpleNamespace(debug=lambda text: None, info=say, warning=say)
 
     def get_clock(self):
-        now = message_class("builtin_interfaces/msg/Time")
-        return SimpleNamespace(now=lambda: SimpleNamespace(to_msg=now))
+        message = message_class("builtin_interfaces/msg/Time")
+        now = SimpleNamespace(to_msg=message, nanoseconds=self.time)
+        return SimpleNamespace(now=lambda: now)
 
 
 class Trigger:
@@ -195,8 +198,9 @@ class Sent:
         self.answer, self.result, self.is_canceled = Done(), Done(), False
 
     def accept(self, accepted: bool = True) -> None:
-        def cancel() -> None:
+        def cancel() -> Done:
             self.is_canceled = True
+            return Done()
 
         self.answer.set(
             SimpleNamespace(
@@ -293,6 +297,8 @@ def modules() -> dict[str, ModuleType]:
             "QoSProfile": anything,
             "qos_profile_sensor_data": None,
         },
+        "rclpy.signals": {"SignalHandlerOptions": SimpleNamespace(NO=0)},
+        "rclpy.task": {"Future": Done},
         "rclpy.time": {"Time": Time},
         "message_filters": {
             "Subscriber": subscriber,

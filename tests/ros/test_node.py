@@ -37,7 +37,7 @@ def module(tmp_path):
         "stride": 1,
         "candidates": 20,
     }
-    with stubs.ros2(**settings, patience=0.1):
+    with stubs.ros2(**settings, patience=0.4):
         yield importlib.import_module("r3jax_ros.node")
 
 
@@ -57,6 +57,7 @@ def play(node, path) -> Iterator[None]:
                     vector(sample.transform.rotation, "xyzw"),
                 )
         elif one.topic in REMAPPED:
+            node.time = one.time
             node.callbacks[REMAPPED[one.topic]](one.message)
         node.callbacks["timer"]()
         yield
@@ -86,10 +87,12 @@ def test_a_bag_goes_in_and_goals_come_out(module, tmp_path):
     node = module.ExplorerNode()
     for _ in play(node, write_bag(tmp_path / "drive", Robot(depth="32FC1"))):
         pass
+    node.time += 1_000_000_000  # nobody drives: the last goal is late
+    node.callbacks["timer"]()
     assert len(node.frames) == NUM
     np.testing.assert_allclose([f.T_world_camera for f in node.frames], camera_poses(), atol=1e-6)
     goals = node.published["next_goal"].sent
-    assert 2 <= len(goals) <= NUM
+    assert 2 <= len(goals) <= NUM + 1
     for goal in goals:
         assert goal.header.frame_id == "map"
         base = module.matrix_of(goal.pose.position, goal.pose.orientation)
@@ -174,6 +177,23 @@ def test_images_wait_for_their_transforms_and_key_frames_for_a_move(module, tmp_
     assert not node.pending  # too soon after the last one
 
 
+def test_an_image_whose_transforms_will_never_come_is_dropped(module, monkeypatch):
+    node, place = module.ExplorerNode(), {"late": None, "early": None, "placed": np.eye(4)}
+    frame = lambda T: module.KeyFrame(0, np.zeros(0), np.zeros(0), T)
+    known = lambda name: None if place[name] is None else frame(place[name])
+    monkeypatch.setattr(node, "key_frame", lambda color, depth: known(color))
+    monkeypatch.setattr(node, "add", node.frames.append)
+    node.running = False
+    node.pending.extend((name, None) for name in ("early", "placed", "late"))
+    node.callbacks["timer"]()
+    assert len(node.frames) == 1
+    assert [color for color, _ in node.pending] == ["late"]
+    place["late"] = moved(1.0, 0.0, 0.0)
+    node.callbacks["timer"]()
+    assert len(node.frames) == 2
+    assert not node.pending
+
+
 def test_corrections_follow_the_trajectory_and_its_end(module):
     key = lambda stamp: module.KeyFrame(stamp, np.zeros(0), np.zeros(0), np.eye(4))
     second = 1_000_000_000
@@ -245,12 +265,66 @@ def test_a_refused_goal_has_failed(driven):
     assert navigator.state == "failed"
 
 
-def test_without_nav2_a_goal_fails_at_once(driven):
-    navigator, nav2, pose = driven
-    nav2.is_ready = False
-    navigator.go(pose(1.0))
-    assert navigator.state == "failed"
-    assert not nav2.sent
+@pytest.fixture
+def deciding(module, monkeypatch):
+    """A node that has mapped a key frame and sends the same goal each time; its decisions."""
+    node = module.ExplorerNode()
+    node.frames.append(module.KeyFrame(0, np.zeros(0), np.zeros(0), np.eye(4)))
+    node.has_news, decided = True, []
+
+    def decide():
+        decided.append(node.navigator.state)
+        node.has_news, node.goal, node.goal_time = False, moved(1.0, 0.0, 0.0), node.time
+        node.navigator.go(module.PoseStamped(pose=module.pose_of(node.goal)))
+
+    monkeypatch.setattr(node, "decide", decide)
+    return node, decided
+
+
+def test_without_nav2_nothing_is_decided_until_it_is_up(deciding):
+    node, decided = deciding
+    node.nav2.is_ready = False
+    node.callbacks["timer"]()
+    assert not decided
+    assert "is Nav2 running?" in node.said[0]
+    node.nav2.is_ready = True
+    node.callbacks["timer"]()
+    assert decided == ["idle"]
+
+
+def test_a_robot_that_stands_still_gets_another_goal_where_the_one_before_failed(deciding):
+    node, decided = deciding
+    node.callbacks["timer"]()
+    node.nav2.sent[0].accept(False)
+    node.callbacks["timer"]()
+    assert decided == ["idle", "failed"]
+    node.nav2.sent[1].accept()
+    node.time = 300_000_000
+    node.callbacks["timer"]()
+    assert len(decided) == 2
+    node.time = 500_000_000  # longer than it has patience, by the clock: no image tells of it
+    node.callbacks["timer"]()
+    assert decided == ["idle", "failed", "failed"]
+    assert node.nav2.sent[1].is_canceled
+
+
+def test_at_a_goal_the_camera_has_turned_to_its_view(module, deciding):
+    node, decided = deciding
+    node.callbacks["timer"]()
+    node.nav2.sent[0].accept()
+    near = lambda yaw: moved(0.9, 0.0, 0.0) @ turned(yaw)
+    for yaw, num in ((60.0, 1), (10.0, 2)):
+        node.frames.append(module.KeyFrame(0, np.zeros(0), np.zeros(0), near(yaw)))
+        node.has_news = True
+        node.callbacks["timer"]()
+        assert len(decided) == num
+
+
+def turned(degrees: float) -> np.ndarray:
+    """A camera that looks to the side."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+    return T
 
 
 @pytest.mark.parametrize("is_accepted_before", [True, False])
@@ -322,13 +396,12 @@ def test_services_start_and_stop(module, monkeypatch):
     assert node.ask("~/stop").success
     assert node.nav2.sent[0].is_canceled
     assert not node.running
-    node.has_news = True
+    node.frames.append(module.KeyFrame(0, np.zeros(0), np.zeros(0), np.eye(4)))
     decided = []
     monkeypatch.setattr(node, "decide", lambda: decided.append(1))
     node.callbacks["timer"]()
     assert not decided
     assert node.ask("~/start").success
-    node.has_news = True
     node.callbacks["timer"]()
     assert decided
     assert not node.ask("~/save").success  # nothing is mapped yet

@@ -7,9 +7,12 @@ waits. See docs/howto/robot.md.
 """
 
 import contextlib
+import signal
+import time
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from threading import Event
 
 import jax
 import message_filters
@@ -22,6 +25,7 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from rclpy.signals import SignalHandlerOptions
 from rclpy.time import Time
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import Header
@@ -29,7 +33,6 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 import r3jax
-from r3jax.apps.audit.live.guide_page import open_guide
 from r3jax.formats.depth import resample_depth
 from r3jax.formats.points import voxel_points
 from r3jax.formats.ros.messages import depth_of, frame_of, lens_of, rgb_of, stamp_of
@@ -38,7 +41,14 @@ from r3jax.planning.robot.motion import make_motion
 from r3jax_ros.messages import Costmap, cloud_of, markers_of, matrix_of, pose_of
 from r3jax_ros.navigation import Navigator
 from r3jax_ros.settings import declared
-from r3jax_ros.trajectory import KeyFrame, base_for_view, corrected, has_moved, track_of
+from r3jax_ros.trajectory import (
+    KeyFrame,
+    base_for_view,
+    corrected,
+    has_arrived,
+    has_moved,
+    track_of,
+)
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """Reliable, and a late subscriber gets the last message, too."""
@@ -58,11 +68,13 @@ class ExplorerNode(Node):
         self.pages, self.mapper = contextlib.ExitStack(), ThreadPoolExecutor(1)
         self.pending, self.frames, self.track = deque(maxlen=10), [], None
         self.info, self.planner, self.goal, self.decisions = None, None, None, 0
-        self.has_news, self.last_stamp, self.goal_stamp, self.chosen = False, 0, 0, None
+        self.has_news, self.last_stamp, self.goal_time, self.chosen = False, 0, 0, None
         self.rebuilding: tuple[Future, int] | None = None
 
         self.page = None
         if settings.page_port:  # the page of `r3jax audit --live`, for this robot
+            from r3jax.apps.audit.live.guide_page import open_guide  # it needs plots: seconds
+
             guide = open_guide(settings.page_host, settings.page_port)
             self.page = self.pages.enter_context(guide)
             self.get_logger().info(f"where it goes next: {self.page.url}")
@@ -85,9 +97,11 @@ class ExplorerNode(Node):
         self.goals = self.create_publisher(PoseStamped, "next_goal", LATCHED)
         self.markers = self.create_publisher(MarkerArray, "next_view", LATCHED)
         self.clouds = self.create_publisher(PointCloud2, "map_points", LATCHED)
-        for name in ("start", "stop", "save", "load"):
+        # A robot that is to stop does not wait for a decision.
+        groups = {"start": incoming, "stop": incoming, "save": self.working, "load": self.working}
+        for name, group in groups.items():
             answer = getattr(self, f"on_{name}")
-            self.create_service(Trigger, f"~/{name}", answer, callback_group=self.working)
+            self.create_service(Trigger, f"~/{name}", answer, callback_group=group)
         self.create_timer(0.1, self.work, callback_group=self.working)
 
     # ------------------------------------------------------------------------------- messages
@@ -145,10 +159,15 @@ class ExplorerNode(Node):
 
     def on_stop(self, request, response):
         """Stops the robot; images are mapped all the while."""
-        self.running, self.goal = False, None
-        self.navigator.cancel()
+        self.stop()
         response.success, response.message = True, "stopped; images are still mapped"
         return response
+
+    def stop(self) -> None:
+        """Cancels the goal, and sends no further one."""
+        with self.navigator.lock:
+            self.running, self.goal = False, None
+            self.navigator.cancel()
 
     def on_save(self, request, response):
         """Writes the planner to `map_file`."""
@@ -187,16 +206,20 @@ class ExplorerNode(Node):
 
     def work(self) -> None:
         """Maps what has come in, and decides where the robot has arrived. In one thread only."""
+        early = []
         for _ in range(len(self.pending)):
             color, depth = self.pending.popleft()
             frame = self.key_frame(color, depth)
             if frame is None:
-                self.pending.append((color, depth))  # its transforms may be still to come
-            elif not self.frames or has_moved(self.frames[-1].T_world_camera, frame.T_world_camera):
+                early.append((color, depth))  # its transforms may be still to come
+                continue
+            early.clear()  # transforms come in the order of time: tf has forgotten those before
+            if not self.frames or has_moved(self.frames[-1].T_world_camera, frame.T_world_camera):
                 self.add(frame)
+        self.pending.extendleft(reversed(early))
         if self.rebuilding is not None and self.rebuilding[0].done():
             self.swap()
-        if self.running and self.rebuilding is None and self.has_news and self.is_due():
+        if self.running and self.rebuilding is None and self.frames and self.is_due():
             self.decide()
 
     def key_frame(self, color, depth) -> KeyFrame | None:
@@ -242,7 +265,9 @@ class ExplorerNode(Node):
         frame = self.to_frame(key_frame)
         if self.planner is None:
             self.begin(frame.camera, key_frame.T_world_camera)
-        self.planner = r3jax.observe(self.planner, frame)
+        self.planner = jax.block_until_ready(r3jax.observe(self.planner, frame))
+        late = (self.get_clock().now().nanoseconds - key_frame.stamp) * 1e-6
+        self.get_logger().debug(f"mapped {late:.0f} ms after its image was taken")
         self.growth.look(self.planner, frame)  # compiles for a larger map before it is one
         self.has_news = True
         if self.page is not None:
@@ -291,23 +316,23 @@ class ExplorerNode(Node):
         return r3jax.Body(footprint, heights, margin=settings.margin, floor=floor)
 
     def is_due(self) -> bool:
-        """True without a goal, at the goal, where Nav2 gave it up, and after `patience`."""
+        """True at the goal or without one, and, even if nothing is new, where the goal failed."""
+        spent = (self.get_clock().now().nanoseconds - self.goal_time) * 1e-9
+        if self.navigator.is_busy and spent > self.settings.patience:
+            self.navigator.give_up(f"not reached in {self.settings.patience:g} s")
+        if not (self.has_news or self.navigator.state == "failed"):
+            return False
+        if not self.navigator.is_ready():
+            return False
         if self.goal is None or not self.navigator.is_busy:
             return True
-        here = self.frames[-1]
-        away = np.linalg.norm(here.T_world_camera[:3, 3] - self.goal[:3, 3])
-        is_late = (here.stamp - self.goal_stamp) * 1e-9 > self.settings.patience
-        return bool(away < self.settings.arrived or is_late)
+        return has_arrived(self.frames[-1].T_world_camera, self.goal, self.settings.arrived)
 
     def decide(self) -> None:
         """Sends the robot to the next view."""
         here, key = self.frames[-1], jax.random.fold_in(jax.random.key(0), self.decisions)
         self.has_news, self.decisions = False, self.decisions + 1
-        if (
-            self.chosen is not None
-            and self.navigator.state == "failed"
-            and hasattr(r3jax, "refuse")
-        ):
+        if self.chosen is not None and self.navigator.state == "failed":
             self.planner = r3jax.refuse(self.planner, self.chosen)
         if self.costmap is not None and self.costmap.is_aligned:
             layer = self.costmap.cost, self.costmap.resolution, self.costmap.origin
@@ -317,21 +342,22 @@ class ExplorerNode(Node):
         self.clouds.publish(cloud_of(header, *voxel_points(self.planner.map_state)))
         if self.page is not None:
             self.page.decided(self.to_frame(here), decision)
-        if decision is None:
+        view = None if decision is None else self.best_open_view(decision)
+        if decision is None or view is None:
             self.navigator.cancel()
             self.goal = None
-            self.get_logger().warning(f"no next view: {info.outcome.value}")
+            closed = "the costmap closes every candidate"
+            why = closed if decision else f"{info.outcome.value}: {info.reason}"
+            self.get_logger().warning(f"no next view: {why}")
             return
-        view = self.best_open_view(decision)
-        if view is None:
-            self.get_logger().warning("the costmap closes every candidate: no goal")
-            return
-        self.goal, self.goal_stamp = view, here.stamp
         self.chosen = replace(decision, T_world_camera=view)
         pose = PoseStamped(header=header, pose=pose_of(self.base_of(view)))
-        self.goals.publish(pose)
-        self.markers.publish(markers_of(header, decision))
-        self.navigator.go(pose)
+        with self.navigator.lock:
+            if self.running:
+                self.goal, self.goal_time = view, self.get_clock().now().nanoseconds
+                self.goals.publish(pose)
+                self.markers.publish(markers_of(header, decision))
+                self.navigator.go(pose)
 
     def base_of(self, T_world_camera: np.ndarray) -> np.ndarray:
         """Where the base stands when the camera has a view."""
@@ -351,16 +377,26 @@ class ExplorerNode(Node):
 
 
 def spin() -> None:
-    """Spins: one thread for images and tf, one for the map, one to spare."""
-    rclpy.init()
+    """Spins: one thread for images and tf, one for the map, one to spare.
+
+    rclpy's own handlers would close the connection first, and the robot would drive on.
+    """
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    interrupted, signals = Event(), (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(one, lambda *_: interrupted.set()) for one in signals]
     node, executor = ExplorerNode(), MultiThreadedExecutor(num_threads=3)
     executor.add_node(node)
     try:
-        executor.spin()
-    except KeyboardInterrupt:
-        pass
+        while not interrupted.is_set():
+            executor.spin_once()
     finally:
-        node.navigator.cancel()
+        for one, handler in zip(signals, before, strict=True):
+            signal.signal(one, handler)  # a second Ctrl-C ends it at once
+        node.stop()
+        end = time.monotonic() + 2.0
+        while not node.navigator.is_settled and time.monotonic() < end:
+            executor.spin_once(timeout_sec=0.1)
+        executor.shutdown()
         node.mapper.shutdown(wait=False, cancel_futures=True)
         node.pages.close()
         node.destroy_node()

@@ -26,6 +26,15 @@ def has_moved(before: np.ndarray, now: np.ndarray) -> bool:
     return bool(np.linalg.norm(now[:3, 3] - before[:3, 3]) > 0.05 or turned > 5.0)
 
 
+def has_arrived(here: np.ndarray, view: np.ndarray, meters: float) -> bool:
+    """True if a camera is this near to a view, and its line of sight within 15 degrees of it.
+
+    The planner's views have no roll; a camera may be mounted on its side.
+    """
+    is_turned = here[:3, 2] @ view[:3, 2] > np.cos(np.radians(15.0))
+    return bool(np.linalg.norm(view[:3, 3] - here[:3, 3]) < meters and is_turned)
+
+
 def track_of(path) -> TransformTree:
     """Where the robot was at each stamp of a path."""
     tree = TransformTree()

@@ -1,0 +1,15 @@
+# The wheels of PyPI name the folder of Python's headers on the machine that built them.
+find_package(ament_cmake REQUIRED)
+find_package(geometry_msgs REQUIRED)
+find_package(action_msgs REQUIRED)
+find_package(rosidl_default_generators REQUIRED)
+find_package(Python3 REQUIRED COMPONENTS Interpreter Development)
+foreach(name geometry_msgs std_msgs builtin_interfaces action_msgs service_msgs unique_identifier_msgs)
+  set(target ${name}::${name}__rosidl_generator_py)
+  if(TARGET ${target})
+    get_target_property(folders ${target} INTERFACE_INCLUDE_DIRECTORIES)
+    list(FILTER folders EXCLUDE REGEX "^/opt/python/")
+    set_target_properties(${target} PROPERTIES INTERFACE_INCLUDE_DIRECTORIES
+      "${folders};${Python3_INCLUDE_DIRS}")
+  endif()
+endforeach()
