@@ -38,6 +38,7 @@ from r3jax.mapping.tiles import (
     ACROSS,
     HYSTERESIS,
     Lattice,
+    Layers,
     Tile,
     Tiles,
     arrays_of,
@@ -346,17 +347,23 @@ def moved_to(known: Known, policy: GreedyPolicy, position: np.ndarray) -> Known:
     if middle_for(far.tiles, position) == far.tiles.middle:
         return known
     far = with_coarse(far, grid, memory, policy.config)
-    layers = {"log_odds": np.asarray(grid.log_odds), "looks": memory.looks}
-    if memory.memory is not None:
-        layers["memory"] = memory.memory
-    after, layers, tiles = page(map_state, layers, far.tiles, position)
+    after, layers, tiles = page(map_state, layers_of(grid, memory), far.tiles, position)
     # Before they are out of hand: what they promise stays true until the robot comes back.
     views = _renewed((map_state, grid, memory, far), policy, tiles.middle, position)
     far = replace(far, tiles=tiles, views=views)
-    memory = replace(
-        memory, looks=layers["looks"], trail=far.trail, memory=layers.get("memory", memory.memory)
-    )
-    return after, far.grid(layers["log_odds"]), memory, far
+    return after, far.grid(layers["log_odds"]), with_layers(memory, layers, far), far
+
+
+def layers_of(grid: OccupancyGrid, memory: PlannerState) -> Layers:
+    """Lists what is kept of the cells at hand when they are paged out."""
+    layers = {"log_odds": np.asarray(grid.log_odds), "looks": memory.looks}
+    return layers if memory.memory is None else layers | {"memory": memory.memory}
+
+
+def with_layers(memory: PlannerState, layers: Layers, far: Far) -> PlannerState:
+    """Replaces what a policy remembers of cells by that of the cells at hand."""
+    by_cell = layers.get("memory", memory.memory)
+    return replace(memory, looks=layers["looks"], trail=far.trail, memory=by_cell)
 
 
 def known_round(

@@ -7,7 +7,7 @@ import numpy as np
 
 from r3jax.errors import InputError
 from r3jax.mapping.tiles import World, merge_worlds
-from r3jax.planning.far import Far, merged_far
+from r3jax.planning.far import Far, layers_of, merged_far, with_layers
 from r3jax.planning.planner import Planner, a_planner
 
 
@@ -42,6 +42,7 @@ def merge_planners(planners: Iterable[Planner]) -> Planner:
             == first.config,
             "tiles (the camera of start)": far.tiles.lattice == fars[0].tiles.lattice,
             "bounds": np.array_equal(far.box, fars[0].box),
+            "policies": planner.policy.name == first.policy.name,
         }
         if not all(same.values()):
             different = ", ".join(name for name, is_same in same.items() if not is_same)
@@ -51,7 +52,9 @@ def merge_planners(planners: Iterable[Planner]) -> Planner:
     worlds = [_world_of(planner, far) for planner, far in zip(planners, fars, strict=True)]
     map_state, layers, tiles = merge_worlds(worlds)
     far = merged_far(fars, tiles)
-    memory = replace(first.policy_state, looks=layers["looks"], trail=far.trail)
+    memory = with_layers(first.policy_state, layers, far)
+    if memory.driven is not None:
+        memory = replace(memory, driven=np.concatenate([p.policy_state.driven for p in planners]))
     return replace(
         first,
         map_state=map_state,
@@ -71,5 +74,4 @@ def _far_of(planner: Planner) -> Far:
 
 
 def _world_of(planner: Planner, far: Far) -> World:
-    layers = {"log_odds": np.asarray(planner.grid.log_odds), "looks": planner.policy_state.looks}
-    return planner.map_state, layers, far.tiles
+    return planner.map_state, layers_of(planner.grid, planner.policy_state), far.tiles

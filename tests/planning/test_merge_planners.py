@@ -127,6 +127,20 @@ def test_cells_add_up_and_the_given_planners_stay():
             np.testing.assert_array_equal(x, rows[name])
 
 
+def test_what_a_policy_remembers_of_cells_is_that_of_all():
+    planners = []
+    for part in (0, 1):
+        start = pose_at([2.0, 2.0, 1.3], 0.0, 0.0)
+        planner = r3jax.start(CAMERA, policy=a_policy("frontier"), starts=[start], config=KEEPS)
+        marks = np.zeros_like(planner.policy_state.memory)
+        marks[part, :2] = True
+        state = replace(planner.policy_state, memory=marks)
+        planners.append(replace(planner, policy_state=state))
+    both = r3jax.merge_planners(planners).policy_state.memory
+    assert both.dtype == bool
+    assert np.argwhere(both.any(axis=2)).tolist() == [[0, 0], [0, 1], [1, 0], [1, 1]]
+
+
 def test_planners_that_do_not_fit_are_refused():
     first = r3jax.start(CAMERA, policy=a_policy(), config=CONFIG)
     with pytest.raises(InputError, match="at least one"):
