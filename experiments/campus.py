@@ -40,7 +40,7 @@ from r3jax.simulators.scenes.registry import open_scene
 _WALL = 0.1
 
 _EYES = {"tower": (1.3, 4.6, 7.9)}
-"""Heights of the floor plans of scenes of several storeys [m]."""
+"""Heights of the floor plans of scenes of several stories [m]."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The tower: closed, and every room of every storey can be reached by a camera that flies."""
+"""The tower: closed, and every room of every story can be reached by a camera that flies."""
 
 import numpy as np
 import pytest
@@ -33,11 +33,11 @@ def eyes_of(rooms):
     return np.array([[*room.center, room.base + EYES] for room in rooms.values()])
 
 
-def test_three_storeys_of_sixty_meters(world, rooms):
+def test_three_stories_of_sixty_meters(world, rooms):
     low, high = world.bounds
     np.testing.assert_allclose((high - low)[:2], 60.5)
     assert 9.0 < (high - low)[2] < 11.0
-    assert len({room.base for room in rooms.values()}) == tower.STOREYS == 3
+    assert len({room.base for room in rooms.values()}) == tower.STORIES == 3
     area = sum((r.x1 - r.x0) * (r.y1 - r.y0) for r in rooms.values())
     assert area == pytest.approx(9900.0, rel=0.01)
     # What a person's computer holds.

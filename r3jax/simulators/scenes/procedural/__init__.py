@@ -1,4 +1,4 @@
-"""Furnished scenes, made by code: nine homes and offices, and a tower of three storeys.
+"""Furnished scenes, made by code: nine homes and offices, and a tower of three stories.
 
     from r3jax.simulators.scenes import procedural
     world = procedural.build("flat")

@@ -42,7 +42,7 @@ class Room:
     ceiling: Finish
     height: Real = 2.6
     base: Real = 0.0
-    """Height of the floor [m]: rooms of several storeys lie in one plan."""
+    """Height of the floor [m]: rooms of several stories lie in one plan."""
     cell: Real = _CELL
     """Largest cell of its surfaces [m]: how finely their corners are shaded."""
     sides: dict[str, Finish] = field(default_factory=dict[str, Finish])

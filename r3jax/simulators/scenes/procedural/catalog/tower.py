@@ -1,7 +1,7 @@
-"""The tower: three storeys of 60 x 60 m round an atrium, over which a flying camera changes floors.
+"""The tower: three stories of 60 x 60 m round an atrium, over which a flying camera changes floors.
 
-Every storey has offices, classrooms, libraries, lounges and meeting rooms along a ring of
-corridors. The rooms that face the atrium open onto it; two of the four do on every storey.
+Every story has offices, classrooms, libraries, lounges and meeting rooms along a ring of
+corridors. The rooms that face the atrium open onto it; two of the four do on every story.
 """
 
 from collections.abc import Callable
@@ -15,11 +15,11 @@ from r3jax.simulators.scenes.procedural.materials.textures import Real
 from r3jax.simulators.scenes.procedural.model import Finish, Model, assemble
 from r3jax.simulators.world import World
 
-SUMMARY = "tower of three storeys round an atrium, 72 furnished rooms, 60 x 60 m, 9900 m2"
+SUMMARY = "tower of three stories round an atrium, 72 furnished rooms, 60 x 60 m, 9900 m2"
 
-STOREYS = 3
+STORIES = 3
 
-_STOREY, _HEIGHT = 3.3, 2.8
+_STORY, _HEIGHT = 3.3, 2.8
 """From floor to floor, and from floor to ceiling [m]."""
 
 _BANDS = {
@@ -39,7 +39,7 @@ _WALL = 0.12
 
 
 def _kind(level: int, x: str, y: str) -> str:
-    """Returns what a room is used for: neighbors differ, and storeys do."""
+    """Returns what a room is used for: neighbors differ, and stories do."""
     number = _ROOMS.index(x) + 2 * _ROOMS.index(y) + 3 * level
     return ("office", "classroom", "lounge", "library", "meeting")[number % 5]
 
@@ -61,12 +61,12 @@ def plan() -> FloorPlan:
              "meeting": (0.8, 0.82, 0.88)}  # fmt: skip
     walls = {kind: f.plaster(tint, 113 + n) for n, (kind, tint) in enumerate(tints.items())}
     white, frame = f.plaster((0.92, 0.91, 0.88), 120), f.enamel(f.CHARCOAL, 3, 0.2)
-    (x0, x1), top = _BANDS["c"], STOREYS * _STOREY - (_STOREY - _HEIGHT)
+    (x0, x1), top = _BANDS["c"], STORIES * _STORY - (_STORY - _HEIGHT)
     brick = f.brick(121, (0.72, 0.6, 0.52))
     drawn.room("atrium", (x0, x0, x1, x1), wall=brick, floor=stone, ceiling=ceiling, height=top,
                cell=_CELL)  # fmt: skip
-    for level in range(STOREYS):
-        base = level * _STOREY
+    for level in range(STORIES):
+        base = level * _STORY
         surfaces = {"floor": stone, "ceiling": ceiling, "height": _HEIGHT, "base": base,
                     "cell": _CELL}  # fmt: skip
         left, right = _BANDS["left"], _BANDS["right"]
@@ -91,7 +91,7 @@ def plan() -> FloorPlan:
 
 
 def _doorways(drawn: FloorPlan, base: Real, frame: Finish, floor: Finish) -> None:
-    """Cuts the doorways of one storey."""
+    """Cuts the doorways of one story."""
     how: dict[str, Any] = {"frame": frame, "floor": floor, "base": base}
     middle = lambda band: sum(_BANDS[band]) / 2
     left, right = _BANDS["left"], _BANDS["right"]
@@ -189,7 +189,7 @@ def _furnish(m: Model, drawn: FloorPlan) -> None:
     panel = objects.ceiling_panel(_HEIGHT, 1.2, 0.6, 6.0)
     subjects = ("landscape", "abstract", "sunset", "poster")
     pictures = [objects.picture(kind, 90 + n, 1.2, 0.8, 1.7) for n, kind in enumerate(subjects)]
-    for level in range(STOREYS):
+    for level in range(STORIES):
         for i, x in enumerate(_ROOMS):
             for j, y in enumerate(_ROOMS):
                 if x == y == "c":
