@@ -33,7 +33,7 @@ from r3jax.planning.robot.body import Body
 from r3jax.planning.robot.explorable import mask_unexplorable
 from r3jax.planning.robot.limits import Limits
 from r3jax.planning.robot.motion import Motion
-from r3jax.planning.robot.room import room_for
+from r3jax.planning.robot.room import PIXELS_PER_CELL, room_for
 from r3jax.planning.robot.travel import NEW_PLACE, Travel, fresh_columns, plan_travel
 from r3jax.scoring.explain import Explanation, explain_view
 from r3jax.scoring.utility import visible_unexplored
@@ -81,7 +81,8 @@ class PlannerState(eqx.Module):
     """Positions and viewing directions of the views taken so far; None for a free-flying camera."""
 
     driven: Float[np.ndarray, "P 2"] | None = None
-    """Places along the paths of a robot on the floor [m]; None for other motions."""
+    """Pixels of the floor plan that a robot on the floor has driven over: their centers [m]; None
+    for other motions."""
 
 
 @dataclass(frozen=True)
@@ -501,22 +502,24 @@ def with_path(state: PlannerState, travel: Travel, waypoints: np.ndarray) -> Pla
     state = replace(state, trail=state.trail | travel.cells_along(waypoints))
     if state.driven is None:
         return state
-    places = np.concatenate([state.driven, _places_along(waypoints[:, :2])])
-    _, first = np.unique(np.floor(places / _SPACING), axis=0, return_index=True)
-    return replace(state, driven=places[np.sort(first)])
+    places = np.concatenate([state.driven, driven_pixels(travel, waypoints)])
+    return replace(state, driven=np.unique(places, axis=0))
 
 
-_SPACING = 0.05
-"""Places of a path are stored so far apart [m]."""
+def driven_pixels(travel: Travel, waypoints: np.ndarray) -> np.ndarray:
+    """Finds the pixels of the floor plan that a path crosses: their centers, [n, 2] float32 [m].
 
+    Args:
+        travel: it has the plan's lattice.
+        waypoints: corners of the path, [K, 3] [m].
+    """
+    from r3jax.kernels.robot.cells import segment_cells
 
-def _places_along(waypoints: np.ndarray) -> np.ndarray:
-    """Places at most `_SPACING` apart along a path over waypoints [K, 2] [m], [n, 2] float32."""
-    parts = [waypoints[:1]]
-    for a, b in itertools.pairwise(waypoints):
-        num = max(int(np.ceil(np.linalg.norm(b - a) / _SPACING)), 1)
-        parts.append(a + (np.arange(1, num + 1) / num)[:, None] * (b - a))
-    return np.concatenate(parts).astype(np.float32)
+    low, size = travel.origin[:2], travel.cell_size / PIXELS_PER_CELL
+    corners = np.column_stack([(waypoints[:, :2] - low) / size, np.full(len(waypoints), 0.5)])
+    cells = [segment_cells(a, b)[:, :2] for a, b in itertools.pairwise(corners)]
+    pixels = np.unique(np.concatenate([np.zeros((0, 2), np.int64), *cells]), axis=0)
+    return (low + (pixels + 0.5) * size).astype(np.float32)
 
 
 def _with_start(state: PlannerState, height: float) -> PlannerState:

@@ -152,7 +152,7 @@ def room_for(
         trail: cells that the robot has come through, [X, Y, Z] bool.
         stood: where its views were taken, the first one first, [V, 2] [m]; None: here only.
         headings: viewing directions of these views, [V, 2]; None: any.
-        driven: places along the driven paths, [P, 2] [m].
+        driven: pixels that it has driven over, their centers, [P, 2] [m].
     """
     known = _Known.of(body, grid, voxels, voxel_size, T_world_camera, trail)
     thin = known.thin_obstacles()
@@ -176,15 +176,14 @@ def room_for(
     low, position = known.origin, known.position
     x, y = (low[i] + pixel * (np.arange(passable.shape[i]) + 0.5) for i in range(2))
     own = np.hypot(x[:, None] - position[0], y[None, :] - position[1])
-    # Where the robot stands and what it has swept is known, whatever the cells say: a doorway that
-    # it has driven through must not close behind it.
+    # Where the robot stands and has stood is known, whatever the cells say.
     is_own = own <= body.needed + pixel
-    swept = [places for places in (stood, driven) if places is not None]
-    if swept:
-        centers = np.floor((np.concatenate(swept) - low[:2]) / pixel).astype(int)
-        # A pixel more: a diagonal step needs the pixels on both sides of it.
-        reach = body.needed / pixel + 1.0
-        passable |= _disks(np.unique(centers, axis=0), reach, passable.shape)
+    for place in () if stood is None else stood:
+        # A window round the place: a mission has hundreds of them.
+        begin = np.floor((place - body.needed - low[:2]) / pixel).astype(int).clip(0)
+        i, j = (slice(k, k + int(2 * body.needed / pixel) + 2) for k in begin)
+        gap = np.hypot(x[i, None] - place[0], y[None, j] - place[1])
+        passable[i, j] |= gap <= body.needed
     closed = ~(passable & by_pixel(~thin) | is_own)
     if grid.closed is not None:
         closed |= by_pixel(grid.closed.any(axis=2))
@@ -192,7 +191,15 @@ def room_for(
     places = known.obstacles[:, :2]
     places = places[np.linalg.norm(places - position[:2], axis=1) > body.radius]
     distance = _distances(closed, places, low[:2], pixel, 0.5 * voxel_size)
-    stop, cost, previous = _search(distance, own, pixel, num, body)
+    way = np.zeros(closed.shape, bool)
+    if driven is not None and len(driven):
+        # It drove there: only what is measured can be in its way. So a doorway does not close
+        # behind it, and no other pixel is taken for known: a path would creep into the unknown.
+        index = np.floor((driven - low[:2]) / pixel).astype(int)
+        way[tuple(index[np.all((index >= 0) & (index < way.shape), axis=1)].T)] = True
+        solid = by_pixel(thin) if grid.closed is None else by_pixel(thin | grid.closed.any(axis=2))
+        way &= _distances(solid & ~is_own, places, low[:2], pixel, 0.5 * voxel_size) >= body.radius
+    stop, cost, previous = _search(distance, own, pixel, num, body, way)
     near = own.reshape(shape[0], num, shape[1], num).min(axis=(1, 3)) <= body.needed + 0.5
     by_column = lambda pixels: pixels.reshape(shape[0], num, shape[1], num).any(axis=(1, 3))
     hit_columns = thin.copy()
@@ -464,17 +471,6 @@ class _Known:
         return found
 
 
-def _disks(centers: np.ndarray, radius: float, shape: tuple[int, ...]) -> np.ndarray:
-    """Marks the pixels of a plan that lie within disks round pixels [n, 2], `shape` bool."""
-    side = np.arange(-int(radius), int(radius) + 1)
-    offsets = np.argwhere(np.hypot(side[:, None], side[None, :]) <= radius) - int(radius)
-    pixels = (centers[:, None] + offsets).reshape(-1, 2)
-    pixels = pixels[np.all((pixels >= 0) & (pixels < shape), axis=1)]
-    found = np.zeros(shape, bool)
-    found[tuple(pixels.T)] = True
-    return found
-
-
 def _edt(mask: np.ndarray) -> np.ndarray:
     return np.asarray(ndimage.distance_transform_edt(mask))
 
@@ -525,7 +521,7 @@ def _distances(
 
 
 def _search(
-    distance: np.ndarray, own: np.ndarray, pixel: float, num: int, body: Body
+    distance: np.ndarray, own: np.ndarray, pixel: float, num: int, body: Body, way: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Searches shortest paths over the plan, and the pixel with most clearance in each column.
 
@@ -534,7 +530,7 @@ def _search(
         of the pixel before each pixel, [x * y].
     """
     # The robot fits at its position, and may leave the margin of obstacles that have come near.
-    usable = (distance >= body.needed) | ((own < _LEAVING) & (distance >= body.radius))
+    usable = (distance >= body.needed) | ((own < _LEAVING) & (distance >= body.radius)) | way
     start = np.unravel_index(np.argmin(own), own.shape)
     is_inside = own[start] < pixel
     usable[start] |= is_inside
