@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from r3jax import files
+from r3jax.errors import InputError
 from r3jax.errors import PathError
 
 Tile = tuple[int, int, int]
@@ -84,7 +85,7 @@ _STEPS = ("place", "mean", "resolution")
 def packed_rows(rows: Rows) -> bytes:
     """Packs the rows of a tile without loss: `unpacked_rows` returns the same bits.
 
-    In real maps 16 to 18 bytes a voxel: about half of the bits of floats are noise.
+    In real maps 14 to 16 bytes a voxel: about half of the bits of floats are noise.
     """
     notes: dict[str, list[object]] = {}
     parts: list[bytes] = []
@@ -109,7 +110,7 @@ def unpacked_rows(data: bytes) -> Rows:
         ValueError: other data.
     """
     if not data.startswith(_MAGIC):
-        raise ValueError("these are not the rows of a tile")
+        raise InputError("these are not the rows of a tile")
     begin = len(_MAGIC) + 4
     end = begin + int.from_bytes(data[begin - 4 : begin], "little")
     arrays: dict[str, Any] = {"misses": None}
