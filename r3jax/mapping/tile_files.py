@@ -25,8 +25,7 @@ from typing import Any
 import numpy as np
 
 from r3jax import files
-from r3jax.errors import InputError
-from r3jax.errors import PathError
+from r3jax.errors import InputError, PathError
 
 Tile = tuple[int, int, int]
 """Number of a tile along each axis."""
