@@ -247,9 +247,11 @@ def promised(audit: Audit) -> str:
         return f"More pictures hardly raise the {now:.0f} %: {what} would show unseen places."
     drawn = 100 * random_promise(audit.plan).middle
     verb, as_many = ("raises", "one") if count == 1 else ("raise", "as many")
+    # New surfaces are new gaps: random pictures may open more than they close.
+    random = f"to about {drawn:.0f} %" if drawn - now >= _LEAST_PROMISE else "hardly at all"
     return (
         f"{these} {verb} the {now:.0f} % to about {middle:.0f} % (in most simulated captures, to "
-        f"between {low:.0f} and {high:.0f} %); {as_many} at random places to about {drawn:.0f} %."
+        f"between {low:.0f} and {high:.0f} %); {as_many} at random places {random}."
     )
 
 
@@ -315,7 +317,7 @@ def saturation() -> str:
 
 def select_command(capture: Path | None) -> str:
     """Returns the command that keeps the fewest frames with nearly all of the quality."""
-    return f"r3jax select {'CAPTURE' if capture is None else shlex.quote(str(capture))} --gain 0.95"
+    return f"r3jax select {'CAPTURE' if capture is None else shlex.quote(str(capture))}"
 
 
 def listed(parts: list[str]) -> str:
