@@ -3,6 +3,7 @@
 python -m tests.mutants [WORD ...]: those whose file, test or fault contains one of the words.
 """
 
+import contextlib
 import os
 import shutil
 import subprocess
@@ -10,6 +11,7 @@ import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from queue import Queue
 
 from tests.mutants import Mutant, geometry, mapping, scoring, splatting
 
@@ -39,7 +41,9 @@ def main(words: list[str]) -> int:
     no_fault = [Mutant("r3jax/__init__.py", "", "", m.test) for m in fresh]
     sound = list(dict.fromkeys(no_fault))
     failing, survivors = 0, 0
-    with ThreadPoolExecutor(PROCESSES) as pool:
+    with contextlib.ExitStack() as copies, ThreadPoolExecutor(PROCESSES) as pool:
+        for _ in range(PROCESSES):
+            _COPIES.put(copied(Path(copies.enter_context(tempfile.TemporaryDirectory()))))
         for mutant, code in zip(sound, pool.map(run, sound), strict=True):
             if code != 0:
                 failing += 1
@@ -66,19 +70,41 @@ def count_in_source(mutant: Mutant) -> int:
 
 def run(mutant: Mutant) -> int:
     """Returns pytest's exit status with the fault."""
-    with tempfile.TemporaryDirectory() as folder:
-        shutil.copytree(ROOT / "r3jax", Path(folder) / "r3jax")
-        path = Path(folder) / mutant.file
-        source = path.read_text(encoding="utf-8")
+    if mutant.file.startswith("r3jax/kernels/"):  # its machine code must not serve another mutant
+        with tempfile.TemporaryDirectory() as folder:
+            return run_in(copied(Path(folder)), mutant)
+    folder = _COPIES.get()
+    try:
+        return run_in(folder, mutant)
+    finally:
+        _COPIES.put(folder)
+
+
+_COPIES: Queue[Path] = Queue()
+"""Copies of the package that mutants of plain Python take in turn: kernels are compiled once."""
+
+
+def copied(folder: Path) -> Path:
+    """Copies the package into a folder, and returns the folder."""
+    shutil.copytree(ROOT / "r3jax", folder / "r3jax")
+    return folder
+
+
+def run_in(folder: Path, mutant: Mutant) -> int:
+    """Returns pytest's exit status with the fault planted in a copy, which is mended afterwards."""
+    path = folder / mutant.file
+    source = path.read_text(encoding="utf-8")
+    options = ["-x", "-q", "-p", "no:cacheprovider", "-o", "addopts=", f"--rootdir={ROOT}"]
+    words = [sys.executable, "-c", _PYTEST, str(folder), *options, str(ROOT / mutant.test)]
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join((str(folder), str(ROOT)))}
+    try:
         path.write_text(source.replace(mutant.original, mutant.mutated, 1), encoding="utf-8")
-        options = ["-x", "-q", "-p", "no:cacheprovider", "-o", "addopts=", f"--rootdir={ROOT}"]
-        words = [sys.executable, "-c", _PYTEST, folder, *options, str(ROOT / mutant.test)]
-        env = {**os.environ, "PYTHONPATH": os.pathsep.join((folder, str(ROOT)))}
-        try:
-            done = subprocess.run(words, cwd=folder, env=env, capture_output=True, timeout=SECONDS)
-        except subprocess.TimeoutExpired:
-            return _CAUGHT
-        return done.returncode
+        done = subprocess.run(words, cwd=folder, env=env, capture_output=True, timeout=SECONDS)
+    except subprocess.TimeoutExpired:
+        return _CAUGHT
+    finally:
+        shutil.copy2(ROOT / mutant.file, path)  # with its time: what is compiled of it stays
+    return done.returncode
 
 
 if __name__ == "__main__":
