@@ -33,7 +33,7 @@ from r3jax.planning.robot.body import Body
 from r3jax.planning.robot.explorable import mask_unexplorable
 from r3jax.planning.robot.limits import Limits
 from r3jax.planning.robot.motion import Motion
-from r3jax.planning.robot.room import PIXELS_PER_CELL, room_for
+from r3jax.planning.robot.room import PIXELS_PER_CELL, Been, room_for
 from r3jax.planning.robot.travel import NEW_PLACE, Travel, fresh_columns, plan_travel
 from r3jax.scoring.explain import Explanation, explain_view
 from r3jax.scoring.utility import visible_unexplored
@@ -406,13 +406,11 @@ def travel_of(
     near = np.asarray(map_state.present) & (center[2] < tallest)
     voxels = center[:, near].T.astype(np.float64, order="C")
     size = float(map_state.voxel_size)
-    stood = headings = None
-    if state.taken is not None:
-        stood, headings = (state.taken[:, i : i + 2].astype(np.float64) for i in (0, 3))
-    driven = state.driven
-    room = room_for(body, grid, voxels, size, pose, state.camera, trail, stood, headings, driven)
+    been = Been(trail, state.taken, state.driven)
+    room = room_for(body, grid, voxels, size, pose, state.camera, been)
     travel = plan_travel(grid, position, trail=trail, heights=heights, room=room)
-    places = position[None, :2] if stood is None else np.concatenate([position[None, :2], stood])
+    stood = np.zeros((0, 2)) if state.taken is None else state.taken[:, :2]
+    places = np.concatenate([position[None, :2], stood])
     return replace(travel, fresh=fresh_columns(travel, trail, places))
 
 

@@ -14,7 +14,7 @@ from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.planning.decide import driven_pixels
 from r3jax.planning.robot.body import Body
 from r3jax.planning.robot.motion import make_motion, motion_of_record
-from r3jax.planning.robot.room import Room, room_for
+from r3jax.planning.robot.room import Been, Room, room_for
 from r3jax.planning.robot.travel import plan_travel
 from r3jax.runs.header import plain_settings
 
@@ -177,8 +177,8 @@ def test_unknown_floor_is_trusted_round_the_first_place_only():
     room = room_for(Body(0.2), grid, ring, VOXEL, pose_at(1.5, 2.0), camera)
     assert np.isfinite(room.cost[12]).any()  # off the place where it started
     assert not np.isfinite(room.cost[17:]).any()  # not over a strip of which nothing was seen
-    first = np.array([[0.5, 0.5]])
-    room = room_for(Body(0.2), grid, ring, VOXEL, pose_at(1.5, 2.0), camera, None, first)
+    first = Been(views=np.array([[0.5, 0.5, HEIGHT, 1.0, 0.0, 0.0]]))
+    room = room_for(Body(0.2), grid, ring, VOXEL, pose_at(1.5, 2.0), camera, first)
     assert not np.isfinite(room.cost[12]).any()
 
 
@@ -200,7 +200,7 @@ def test_a_driven_path_leads_back_until_something_is_measured_on_it(corners, rad
     def back(driven, *things) -> float:
         body, voxels = Body(radius, floor=0.0), np.concatenate([np.zeros((0, 3)), *things])
         return room_for(
-            body, grid, voxels, VOXEL, pose_at(*path[-1]), driven=driven
+            body, grid, voxels, VOXEL, pose_at(*path[-1]), been=Been(driven=driven)
         ).cost[first]  # fmt: skip
 
     length = sum(np.linalg.norm(b - a) for a, b in itertools.pairwise(path))
@@ -237,15 +237,15 @@ def test_a_low_camera_that_looks_down_trusts_the_floor_near_its_views_only():
     level = down[:3, :3].copy()
     down[:3, 2] = np.cos(angle) * level[:, 2] - np.sin(angle) * np.array([0.0, 0.0, 1.0])
     down[:3, 1] = np.cross(down[:3, 2], level[:, 0])
-    opened = lambda pose, *views: room_for(
-        Body(0.1), grid_of(free), floor_voxels(), VOXEL, pose, camera, None, *views
+    opened = lambda pose, views=None: room_for(
+        Body(0.1), grid_of(free), floor_voxels(), VOXEL, pose, camera, Been(views=views)
     ).fits(np.array([[1.4, 2.0], [2.4, 2.0], [3.4, 2.0]]))
     np.testing.assert_array_equal(opened(pose_at(1.0, 2.0, 0.3)), [True, True, True])
     np.testing.assert_array_equal(opened(down), [True, False, False])
-    places = np.array([[1.0, 2.0], [2.0, 2.0]])
-    toward, away = np.array([[1.0, 0.0], [1.0, 0.0]]), np.array([[1.0, 0.0], [-1.0, 0.0]])
-    np.testing.assert_array_equal(opened(down, places, toward), [True, True, False])
-    np.testing.assert_array_equal(opened(down, places, away), [True, False, False])
+    toward = np.array([[1.0, 2.0, 0.3, 1.0, 0.0, 0.0], [2.0, 2.0, 0.3, 1.0, 0.0, 0.0]])
+    away = toward * [[1.0] * 6, [1.0, 1.0, 1.0, -1.0, 1.0, 1.0]]
+    np.testing.assert_array_equal(opened(down, toward), [True, True, False])
+    np.testing.assert_array_equal(opened(down, away), [True, False, False])
 
 
 @pytest.mark.parametrize("top", [0.5, 0.75, 1.0])

@@ -128,6 +128,20 @@ class Room:
         return np.asarray(self.fits(start[:2] + shares[:, None, None] * gap).all(axis=0))
 
 
+@dataclass(frozen=True)
+class Been:
+    """Where a robot has been."""
+
+    trail: np.ndarray | None = None
+    """Cells that it has come through, [X, Y, Z] bool."""
+
+    views: np.ndarray | None = None
+    """Positions and directions of its views, the first one first, [V, 6] [m]; None: here only."""
+
+    driven: np.ndarray | None = None
+    """Pixels of the plan that it has driven over: their centers, [P, 2] [m]."""
+
+
 def room_for(
     body: Body,
     grid: OccupancyGrid,
@@ -135,10 +149,7 @@ def room_for(
     voxel_size: float,
     T_world_camera: np.ndarray,
     camera: Camera | None = None,
-    trail: np.ndarray | None = None,
-    stood: np.ndarray | None = None,
-    headings: np.ndarray | None = None,
-    driven: np.ndarray | None = None,
+    been: Been = Been(),
 ) -> Room:
     """Makes the plan for a body with a footprint.
 
@@ -149,70 +160,43 @@ def room_for(
         voxel_size: edge of a voxel [m].
         T_world_camera: where the camera is, [4, 4].
         camera: its lens, which tells how near it sees the floor; None: it does not.
-        trail: cells that the robot has come through, [X, Y, Z] bool.
-        stood: where its views were taken, the first one first, [V, 2] [m]; None: here only.
-        headings: viewing directions of these views, [V, 2]; None: any.
-        driven: pixels that it has driven over, their centers, [P, 2] [m].
+        been: where the robot has been.
     """
-    known = _Known.of(body, grid, voxels, voxel_size, T_world_camera, trail)
-    thin = known.thin_obstacles()
-    num, shape = PIXELS_PER_CELL, known.free.shape
-    pixel = known.size / num
-    by_pixel = lambda columns: np.repeat(np.repeat(columns, num, axis=0), num, axis=1)
-    seen = by_pixel(known.seen_columns(_highest_seen(camera, T_world_camera, known.height, body)))
-    floor = by_pixel(known.floor_columns()) | (known.seen_floor(num) & seen)
-    reach = known.reach_above_floor(camera, T_world_camera)
-    if camera is not None and reach < _MAX_BLIND:
-        ahead = np.asarray(T_world_camera, np.float64)[:2, 2]
-        places, ways = known.position[None, :2], ahead[None]
-        if stood is not None and headings is not None:
-            places, ways = np.concatenate([places, stood]), np.concatenate([ways, headings])
-        floor &= known.shown_within(camera, places, ways, reach, num)
-    passable = by_pixel(known.columns()) | floor
-    if body.unknown_below == "free":
-        blind = _blind_radius(camera, T_world_camera, known.height)
-        first = known.position[:2] if stood is None or not len(stood) else stood[0]
-        passable |= known.blind_spot(passable | floor, first, blind, num) & by_pixel(~thin)
-    low, position = known.origin, known.position
-    x, y = (low[i] + pixel * (np.arange(passable.shape[i]) + 0.5) for i in range(2))
-    own = np.hypot(x[:, None] - position[0], y[None, :] - position[1])
-    # Where the robot stands and has stood is known, whatever the cells say.
+    known = _Known.of(body, grid, voxels, voxel_size, T_world_camera, been.trail)
+    low, pixel, position = known.origin[:2], known.pixel, known.position[:2]
+    passable = known.passable(camera, T_world_camera, been.views)
+    own = np.hypot(*known.round_place(position)[1:])
+    # Where the robot stands is known, whatever the cells say; but no zone ends under it.
     is_own = own <= body.needed + pixel
-    for place in () if stood is None else stood:
-        # A window round the place: a mission has hundreds of them.
-        begin = np.floor((place - body.needed - low[:2]) / pixel).astype(int).clip(0)
-        i, j = (slice(k, k + int(2 * body.needed / pixel) + 2) for k in begin)
-        gap = np.hypot(x[i, None] - place[0], y[None, j] - place[1])
-        passable[i, j] |= gap <= body.needed
-    closed = ~(passable & by_pixel(~thin) | is_own)
+    thin = known.thin
+    solid = known.by_pixel(thin) & ~is_own
     if grid.closed is not None:
-        closed |= by_pixel(grid.closed.any(axis=2))
+        solid |= known.by_pixel(grid.closed.any(axis=2))
     # The robot is not inside of anything: what seems to be there is itself, or noise.
     places = known.obstacles[:, :2]
-    places = places[np.linalg.norm(places - position[:2], axis=1) > body.radius]
-    distance = _distances(closed, places, low[:2], pixel, 0.5 * voxel_size)
-    way = np.zeros(closed.shape, bool)
-    if driven is not None and len(driven):
+    places = places[np.linalg.norm(places - position, axis=1) > body.radius]
+    clearance = functools.partial(
+        _distances, obstacles=places, low=low, pixel=pixel, half=0.5 * voxel_size
+    )
+    distance = clearance(solid | ~(passable | is_own))
+    way = np.zeros(solid.shape, bool)
+    if been.driven is not None and len(been.driven):
         # It drove there: only what is measured can be in its way. So a doorway does not close
         # behind it, and no other pixel is taken for known: a path would creep into the unknown.
-        index = np.floor((driven - low[:2]) / pixel).astype(int)
+        index = np.floor((been.driven - low) / pixel).astype(int)
         way[tuple(index[np.all((index >= 0) & (index < way.shape), axis=1)].T)] = True
-        solid = by_pixel(thin) if grid.closed is None else by_pixel(thin | grid.closed.any(axis=2))
-        way &= _distances(solid & ~is_own, places, low[:2], pixel, 0.5 * voxel_size) >= body.radius
-    stop, cost, previous = _search(distance, own, pixel, num, body, way)
-    near = own.reshape(shape[0], num, shape[1], num).min(axis=(1, 3)) <= body.needed + 0.5
-    by_column = lambda pixels: pixels.reshape(shape[0], num, shape[1], num).any(axis=(1, 3))
+        way &= clearance(solid) >= body.radius
+    stop, cost, previous = _search(distance, own, pixel, body, way)
+    near = known.by_column(own <= body.needed + 0.5)
     hit_columns = thin.copy()
-    hit_columns[tuple(np.floor((places - low[:2]) / known.size).astype(np.int64).T)] = True
+    hit_columns[tuple(np.floor((places - low) / known.size).astype(np.int64).T)] = True
     counts = {
         "near": int(near.sum()),
-        "unknown": int((near & ~by_column(passable) & ~thin).sum()),
+        "unknown": int((near & ~known.by_column(passable) & ~thin).sum()),
         "obstacle": int((near & hit_columns).sum()),
         "open": int((near & np.isfinite(cost)).sum()),
     }
-    return Room(
-        distance, low[:2].copy(), pixel, body.needed, stop, cost, previous, known.floor, counts
-    )
+    return Room(distance, low.copy(), pixel, body.needed, stop, cost, previous, known.floor, counts)
 
 
 @dataclass(frozen=True)
@@ -284,6 +268,66 @@ class _Known:
         return cls(body, free, occupied, origin, size, voxels, above, cells, voxel_size, position,
                    height, floor, within, low, top, been)  # fmt: skip
 
+    @property
+    def pixel(self) -> float:
+        """Side of a pixel [m]."""
+        return self.size / PIXELS_PER_CELL
+
+    def by_pixel(self, columns: np.ndarray) -> np.ndarray:
+        """Spreads columns [X, Y] over their pixels, [x, y]."""
+        return np.repeat(np.repeat(columns, PIXELS_PER_CELL, axis=0), PIXELS_PER_CELL, axis=1)
+
+    def by_column(self, pixels: np.ndarray) -> np.ndarray:
+        """Finds columns with one of these pixels [x, y] at least, [X, Y]."""
+        x, y = self.free.shape[:2]
+        return pixels.reshape(x, PIXELS_PER_CELL, y, PIXELS_PER_CELL).any(axis=(1, 3))
+
+    def round_place(
+        self, place: np.ndarray, reach: float = math.inf
+    ) -> tuple[tuple[slice, slice], np.ndarray, np.ndarray]:
+        """Measures from a place [2] to the centers of the pixels within reach [m].
+
+        Returns:
+            The window of these pixels [i, j], and the offsets along x [i, 1] and y [1, j] [m].
+        """
+        window, offsets = [], []
+        for axis in (0, 1):
+            num = PIXELS_PER_CELL * self.free.shape[axis]
+            gap = self.origin[axis] + self.pixel * (np.arange(num) + 0.5) - place[axis]
+            low, high = np.searchsorted(gap, (-reach, reach))
+            window.append(slice(low, high))
+            offsets.append(gap[low:high])
+        return (window[0], window[1]), offsets[0][:, None], offsets[1][None, :]
+
+    def passable(
+        self, camera: Camera | None, T_world_camera: np.ndarray, views: np.ndarray | None
+    ) -> np.ndarray:
+        """Finds pixels that are known as far as the body takes them up, [x, y] bool.
+
+        Args:
+            camera: its lens; None: it shows no floor.
+            T_world_camera: where it is, [4, 4].
+            views: positions and directions of the views so far, [V, 6] [m].
+        """
+        T = np.asarray(T_world_camera, np.float64)
+        views = np.zeros((0, 6)) if views is None else views.astype(np.float64)
+        seen = self.seen_columns(_highest_seen(camera, T, self.height, self.body))
+        floor = self.by_pixel(self.floor_columns()) | (self.seen_floor() & self.by_pixel(seen))
+        reach = self.reach_above_floor(camera, T)
+        if camera is not None and reach < _MAX_BLIND:
+            now = np.concatenate([T[:3, 3], T[:3, 2]])[None]
+            floor &= self.shown_within(camera, np.concatenate([now, views]), reach)
+        known = self.by_pixel(self.columns()) | floor
+        if self.body.unknown_below == "free":
+            blind = _blind_radius(camera, T, self.height)
+            first = views[0, :2] if len(views) else self.position[:2]
+            known |= self.blind_spot(known, first, blind) & self.by_pixel(~self.thin)
+        # Where the robot has stood is known, whatever the cells say.
+        for place in views[:, :2]:
+            window, x, y = self.round_place(place, self.body.needed)
+            known[window] |= np.hypot(x, y) <= self.body.needed
+        return known
+
     @functools.cached_property
     def obstacles(self) -> np.ndarray:
         """Centers of voxels that the body would touch, [n, 3] [m]."""
@@ -303,8 +347,9 @@ class _Known:
             found[x[:, 0], y[:, 1], z[:, 2]] = True
         return found
 
-    def thin_obstacles(self) -> np.ndarray:
-        """Finds columns with an occupied cell above the floor that no obstacle explains, [X, Y].
+    @functools.cached_property
+    def thin(self) -> np.ndarray:
+        """Columns with an occupied cell above the floor that no obstacle explains, [X, Y].
 
         The seat of a chair does not explain what was measured below it: that is a leg.
         """
@@ -375,8 +420,9 @@ class _Known:
             np.put_along_axis(known, lowest, True, axis=2)
         return np.all(known, axis=2)
 
-    def seen_floor(self, num: int) -> np.ndarray:
-        """Finds pixels at which the floor was seen, [num X, num Y] bool."""
+    def seen_floor(self) -> np.ndarray:
+        """Finds pixels at which the floor was seen, [x, y] bool."""
+        num = PIXELS_PER_CELL
         shape = num * self.free.shape[0], num * self.free.shape[1]
         pixels = lambda voxels: tuple(
             np.clip((voxels[:, i] - self.origin[i]) * num / self.size, 0, shape[i] - 1).astype(int)
@@ -388,7 +434,7 @@ class _Known:
         # Gaps between voxels are filled, and between the rows of an image where nothing stands:
         # what hides in them would have to be narrower than they are.
         least = max(1.0, self.voxel_size * num / self.size)
-        is_clear = np.repeat(np.repeat(~self.beside, num, axis=0), num, axis=1)
+        is_clear = self.by_pixel(~self.beside)
         return _closed(seen, least) | (_closed(seen, least + 1.0) & is_clear)
 
     def reach_above_floor(self, camera: Camera | None, T_world_camera: np.ndarray) -> float:
@@ -403,49 +449,39 @@ class _Known:
         needed = _highest_seen(camera, T_world_camera, self.height, self.body)
         return (self.height - min(needed, self.low + 0.5 * self.size)) / -slope
 
-    def shown_within(
-        self, camera: Camera, places: np.ndarray, headings: np.ndarray, reach: float, num: int
-    ) -> np.ndarray:
-        """Finds pixels that a view had ahead of it within a distance, [num X, num Y] bool.
+    def shown_within(self, camera: Camera, views: np.ndarray, reach: float) -> np.ndarray:
+        """Finds pixels that a view had ahead of it within a distance, [x, y] bool.
 
         Args:
             camera: its lens.
-            places: where the views were taken, [V, 2] [m].
-            headings: their viewing directions, [V, 2].
+            views: positions and directions of the views, [V, 6] [m].
             reach: the distance [m].
-            num: pixels along a cell.
         """
-        pixel, shape = self.size / num, (num * self.free.shape[0], num * self.free.shape[1])
-        found = np.zeros(shape, bool)
-        x, y = (self.origin[i] + pixel * (np.arange(shape[i]) + 0.5) for i in (0, 1))
+        found = np.zeros([PIXELS_PER_CELL * n for n in self.free.shape[:2]], bool)
         least = float(camera.fx) / math.hypot(float(camera.fx), 0.5 * camera.width)  # a cosine
-        for place, ahead in zip(places, headings, strict=True):
-            begin = np.floor((place - reach - self.origin[:2]) / pixel).astype(int).clip(0)
-            i, j = (slice(k, k + int(2 * reach / pixel) + 2) for k in begin)
-            dx, dy = x[i, None] - place[0], y[None, j] - place[1]
-            gap, norm = np.hypot(dx, dy), max(float(np.hypot(*ahead)), 1e-9)
-            is_ahead = (dx * ahead[0] + dy * ahead[1]) / norm >= least * gap
-            found[i, j] |= is_ahead & (gap <= reach)
+        for view in views:
+            window, x, y = self.round_place(view[:2], reach)
+            gap, norm = np.hypot(x, y), max(float(np.hypot(view[3], view[4])), 1e-9)
+            is_ahead = (x * view[3] + y * view[4]) / norm >= least * gap
+            found[window] |= is_ahead & (gap <= reach)
         return found
 
-    def blind_spot(
-        self, known: np.ndarray, first: np.ndarray, blind: float, num: int
-    ) -> np.ndarray:
+    def blind_spot(self, known: np.ndarray, first: np.ndarray, blind: float) -> np.ndarray:
         """Finds what the camera could not see of the floor round the robot's first place.
 
         It looked over it, and sees the floor behind; later places it has looked at from afar.
 
         Args:
-            known: pixels that are known, [num X, num Y] bool.
+            known: pixels that are known, [x, y] bool.
             first: where the first view was taken, [2] [m].
             blind: how far from the robot the image first shows the floor [m].
-            num: pixels along a cell.
 
         Returns:
-            [num X, num Y] bool.
+            [x, y] bool.
         """
         if blind <= 0.0:
             return np.zeros(known.shape, bool)
+        num = PIXELS_PER_CELL
         shape = self.free.shape[:2]
         hit = np.zeros(shape, bool)
         tall = self.cells[self.above > self.body.step + self.voxel_size]
@@ -458,7 +494,7 @@ class _Known:
             near = np.asarray(ndimage.binary_dilation(near, square, mask=~hit), bool)
         near = near & np.any(self.free & self.within, axis=2)
         gap = num * (blind / self.size + 1.0)
-        found = np.repeat(np.repeat(near, num, axis=0), num, axis=1)
+        found = self.by_pixel(near)
         rows, columns = (np.flatnonzero(near.any(axis=axis)) for axis in (1, 0))
         if not len(rows):
             return found
@@ -521,7 +557,7 @@ def _distances(
 
 
 def _search(
-    distance: np.ndarray, own: np.ndarray, pixel: float, num: int, body: Body, way: np.ndarray
+    distance: np.ndarray, own: np.ndarray, pixel: float, body: Body, way: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Searches shortest paths over the plan, and the pixel with most clearance in each column.
 
@@ -537,6 +573,7 @@ def _search(
     first = (int(start[0]), int(start[1]), 0) if is_inside else None
     cost, previous = shortest_paths(usable[:, :, None], first)
     cost, previous = cost[:, :, 0] * pixel, previous[:, :, 0].reshape(-1)
+    num = PIXELS_PER_CELL
     x, y = distance.shape[0] // num, distance.shape[1] // num
     by_cell = lambda a: a.reshape(x, num, y, num).transpose(0, 2, 1, 3).reshape(x, y, num * num)
     fits = np.where(distance >= body.needed, distance, -np.inf)
