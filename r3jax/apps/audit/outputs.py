@@ -7,7 +7,7 @@ suggested_transforms.json  the same as a transforms.json
 audit.json                 every number; `alignment` maps the capture to z up and units of a meter
 preview.ply                a splat, in these coordinates (`--preview`)
 
-The splat is trained in about two minutes, on downscaled versions of the pictures used, with none
+The splat is trained in two to three minutes, on downscaled versions of the pictures used, with none
 held out. It shows where holes and blur will appear; it is not meant as a final model.
 """
 

@@ -515,7 +515,7 @@ def _about_surfaces(audit: Audit) -> list[tuple[float, str, str]]:
     count = len(audit.plan.views)
     seen = [f"{100 * missing[cause]:.0f} % {SHORT[cause]}" for cause in told]
     rest = (
-        f"They show surfaces seen {listed(seen)}."
+        f"They show what was seen too little: of the surface {listed(seen)}."
         if seen
         else "They show the surfaces seen least well; few of the known ones need more views."
     )

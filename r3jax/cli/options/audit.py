@@ -73,7 +73,7 @@ class AuditOptions:
     depth_info, frame, world. By default they are detected."""
 
     preview: bool = False
-    """Train a splat on small images, too, in about two minutes: `r3jax view` shows it beside the
+    """Train a splat on small images, too, in two to three minutes: `r3jax view` shows it beside the
     surfaces."""
 
     terms: Annotated[AuditSettings, _TERMS] = field(default_factory=AuditSettings)
