@@ -269,8 +269,12 @@ def _decide_far(
     assert before.far is not None
     policy, here = cast(GreedyPolicy, before.policy), pose[:3, 3]
     memory = cast(PlannerState, after.policy_state)
-    far = with_coarse(arrived(before.far, here), before.grid, memory, policy.config)
-    best, left = weigh_far(far, policy, decision, pose)
+    viewed = before.policy_state.memory
+    # A policy that has viewed all frontier cells at hand starts over: first come those far away.
+    starts_over = policy.memory_by_cell and bool(np.any(viewed & ~memory.memory))
+    known = replace(memory, memory=viewed | memory.memory) if starts_over else memory
+    far = with_coarse(arrived(before.far, here), before.grid, known, policy.config)
+    best, left = weigh_far(far, policy, None if starts_over else decision, pose)
     if decision is not None:
         left = with_views(left, decision, here, policy.config.radius)
     if best is not decision and best is not None:

@@ -249,6 +249,43 @@ def test_a_frontier_far_away_is_a_goal_though_no_view_of_it_was_scored():
     assert weigh_far(arrived(after, end), a_policy(), None, here)[0] is None  # it is tried once
 
 
+def in_a_corridor(name, viewed):
+    """A planner in a corridor of 50 m, neither end of which is known, and where the robot is."""
+    planner = r3jax.start(CAMERA, policy=a_policy(name), config=CONFIG, starts=[at_cell(4, 2, 2)])
+    far = replace(planner.far, tiles=replace(planner.far.tiles, middle=(0, 0, 9)))
+    free = a_box((0, 0, 0), (200, 4, 4))
+    far = known(far, free)
+    cells = {tile: dict(layers) for tile, layers in far.tiles.cells.items()}
+    for x in (-1, 201):
+        for cell in a_box((x, -1, -1), (x, 5, 5)):
+            tile, local = np.divmod(cell, far.tiles.lattice.cells)
+            layer = cells[tuple(tile.tolist())]
+            odds = np.array(unpacked_layer(layer["log_odds"], far.tiles.lattice.cells))
+            odds[tuple(local)] = 0.0
+            layer["log_odds"] = packed_layer(odds)
+    tiles = replace(far.tiles, cells=cells)
+    far = updated(replace(far, tiles=tiles, coarse=Coarse(far.tiles.lattice)))
+    here = at_cell(4, 2, 2)
+    grid = far.grid(np.zeros(far.tiles.lattice.shape, np.float32))
+    planner = at_hand(replace(planner, far=far, grid=grid), here[:3, 3])
+    memory = np.full(planner.grid.log_odds.shape, viewed)
+    return replace(planner, policy_state=replace(planner.policy_state, memory=memory)), here
+
+
+def test_frontier_views_cells_far_away_before_it_starts_over_with_those_at_hand():
+    planner, here = in_a_corridor("frontier", viewed=False)
+    first, _, _ = r3jax.decide(planner, here, KEY)
+    assert first.length < 3.0
+    planner, here = in_a_corridor("frontier", viewed=True)
+    decision, after, _ = r3jax.decide(planner, here, KEY)
+    assert decision.T_world_camera[0, 3] > 45.0
+    np.testing.assert_array_equal(after.policy_state.memory, True)
+    tried = replace(after.far, tried=decision.waypoints[-1:], goal=after.far.goal[:0])
+    again, after, _ = r3jax.decide(replace(planner, far=tried), here, KEY)
+    assert again.length < 3.0
+    assert not after.policy_state.memory.all()
+
+
 def the_ring():
     """Two corridors of 20 m side by side, joined at both ends; the robot came through one."""
     far = replace(far_at([0.1, 0.1, 0.1]), trails=way((2, 2, 2), (2, 22, 2), (82, 22, 2)))
