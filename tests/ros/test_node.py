@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 import r3jax
 from r3jax.formats.points import voxel_points
 from r3jax.formats.ros.bags import Bag
+from r3jax.formats.ros.transforms import TransformTree
 from tests.apps.audit.room import SIZE
 from tests.formats.bags import COLOR, DEPTH, Robot, camera_poses, moved, write_bag
 from tests.formats.phones import NUM, Z_UP_FROM_ROOM
@@ -142,6 +143,8 @@ def closed_loop(module, node):
     node.said.clear()
     before, poses = voxels(node), [f.T_world_camera for f in node.frames]
     shift = moved(1.0, 0.0, 0.0)
+    node.callbacks["path"](path_message(module, robot, [0] * len(times)))
+    assert "stamp of its own time" in node.said.pop()
     node.callbacks["path"](path_message(module, robot, times))
     node.callbacks["path"](path_message(module, [moved(0.01, 0, 0) @ T for T in robot], times))
     assert node.said == []
@@ -205,6 +208,32 @@ def test_corrections_follow_the_trajectory_and_its_end(module):
     np.testing.assert_allclose(found, [[0, 0, 0], [0, 0.2, 0], [0, 0.4, 0]], atol=1e-9)
     empty = module.track_of(module.Path())
     assert module.corrected(frames, empty, after) is frames
+
+
+@given(gaps=st.lists(st.floats(0.1, 300.0), min_size=4, max_size=8), closes=st.integers(2, 3))
+def test_a_path_that_grows_closes_its_loop_however_sparse(gaps, closes):
+    """SLAM adds a node now and then, and moves all but the first ones when it closes a loop."""
+    with stubs.ros2():
+        trajectory = importlib.import_module("r3jax_ros.trajectory")
+    times = (np.cumsum([0.0, *gaps]) * 1e9).astype(np.int64)
+    at_rest = np.array([0.0, 0.0, 0.0, 1.0])
+
+    def path(num: int, shift: float = 0.0) -> TransformTree:
+        tree = TransformTree()
+        for i, time in enumerate(times[:num]):
+            place = np.array([float(i), shift * (i >= closes), 0.0])
+            tree.add("world", "robot", int(time), place, at_rest)
+        return tree
+
+    track = path(2)
+    for num in range(3, len(times) + 1):
+        track = trajectory.with_later(track, path(num))
+    stamps = np.sort(np.concatenate([times, (times[1:] + times[:-1]) // 2]))
+    frames = [trajectory.KeyFrame(int(t), np.zeros(0), np.zeros(0), np.eye(4)) for t in stamps]
+    for frame in trajectory.corrected(frames, track, path(len(times), 1.0)):
+        x, y, z = frame.T_world_camera[:3, 3]
+        share = np.interp(frame.stamp, times[closes - 1 : closes + 1], [0.0, 1.0])
+        np.testing.assert_allclose([x, y, z], [0.0, share, 0.0], atol=1e-6)
 
 
 _angle = st.floats(-180.0, 180.0)

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from r3jax.formats.poses import MAX_DISTANCE
 
-_MAX_GAP = 1_000_000_000
-"""Samples farther than this from a time say nothing about it [ns]."""
+MAX_GAP = 1_000_000_000
+"""Samples of tf farther than this from a time say nothing about it [ns]."""
 
 _MAX_HOLD = 50_000_000
 """So long before its first and after its last sample an edge stays where it was [ns]."""
@@ -43,8 +43,13 @@ class Edge:
     rotations: list[np.ndarray] = field(default_factory=list[np.ndarray])
     """Quaternions x y z w, frame to parent, [4] each."""
 
-    def at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Interpolates transforms `T_parent_frame` [n, 4, 4], and marks the known ones [n]."""
+    def at(self, times: np.ndarray, max_gap: float = MAX_GAP) -> tuple[np.ndarray, np.ndarray]:
+        """Interpolates transforms `T_parent_frame` [n, 4, 4], and marks the known ones [n].
+
+        Args:
+            times: [n] int64 [ns].
+            max_gap: samples farther than this from a time say nothing about it [ns].
+        """
         moves = np.tile(np.eye(4), (len(times), 1, 1))
         positions, rotations = np.stack(self.positions), np.stack(self.rotations)
         if not self.times:
@@ -56,7 +61,7 @@ class Edge:
         left = np.where(known[right] > times, right - 1, right).clip(0)
         off = np.maximum(np.abs(times - known[left]), np.abs(known[right] - times))
         is_inside = (known[0] <= times) & (times <= known[-1])
-        is_known = off <= np.where(is_inside, _MAX_GAP, _MAX_HOLD)
+        is_known = off <= np.where(is_inside, max_gap, _MAX_HOLD)
         seconds = (known - known[0]) * 1e-9
         asked = (times.clip(known[0], known[-1]) - known[0]) * 1e-9
         for axis in range(3):

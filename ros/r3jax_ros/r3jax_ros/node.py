@@ -48,6 +48,7 @@ from r3jax_ros.trajectory import (
     has_arrived,
     has_moved,
     track_of,
+    with_later,
 )
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -130,6 +131,13 @@ class ExplorerNode(Node):
 
     def on_path(self, path) -> None:
         """Moves the key frames with the trajectory, and maps them again if they moved."""
+        if len(path.poses) > 1 and len({stamp_of(pose) for pose in path.poses}) == 1:
+            self.get_logger().warning(
+                "all poses of the path have one stamp, so that loop closures cannot be followed: "
+                "each pose needs the stamp of its own time",
+                throttle_duration_sec=60.0,
+            )
+            return
         if self.rebuilding is not None:
             return  # the next path tells of what this one does
         before, self.track = self.track, track_of(path)
@@ -139,7 +147,7 @@ class ExplorerNode(Node):
         off = [np.abs(a.T_world_camera - b.T_world_camera).max() for a, b in
                zip(moved, self.frames, strict=True)]  # fmt: skip
         if max(off) <= MOVED:
-            self.track = before  # small steps add up
+            self.track = with_later(before, self.track)  # small steps add up
             return
         self.get_logger().info(f"loop closed: mapping {len(moved)} key frames again")
         self.navigator.cancel()

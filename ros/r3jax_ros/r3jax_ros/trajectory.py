@@ -45,16 +45,33 @@ def track_of(path) -> TransformTree:
     return tree
 
 
+def with_later(before: TransformTree, after: TransformTree) -> TransformTree:
+    """An earlier path with what a later one has added to its end: where each node was at first."""
+    old, new = before.edges.get("robot"), after.edges.get("robot")
+    if old is None or new is None:
+        return after if old is None else before
+    whole, last = TransformTree(), max(old.times)
+    for edge, since in ((old, -1), (new, last)):
+        for time, position, turn in zip(edge.times, edge.positions, edge.rotations, strict=True):
+            if time > since:
+                whole.add("world", "robot", time, position, turn)
+    return whole
+
+
 def corrected(
     frames: list[KeyFrame], before: TransformTree, after: TransformTree
 ) -> list[KeyFrame]:
-    """Key frames moved as the robot's place at their time was; the latest as its last place."""
+    """Key frames moved as the robot's place at their time was; the latest as its last place.
+
+    Nodes of a path may be minutes apart, as SLAM adds none while a robot stands: where both ends
+    move alike, so does all between them.
+    """
     if not before.edges or not after.edges:
         return frames
     times = np.array([frame.stamp for frame in frames], dtype=np.int64)
     known = np.array(before.edges["robot"].times)
     times = times.clip(known.min(), known.max())
-    (old, was), (new, now) = (tree.edges["robot"].at(times) for tree in (before, after))
+    (old, was), (new, now) = (tree.edges["robot"].at(times, np.inf) for tree in (before, after))
     moves = np.where((was & now)[:, None, None], new @ np.linalg.inv(old), np.eye(4))
     return [replace(frame, T_world_camera=move @ frame.T_world_camera) for frame, move in
             zip(frames, moves, strict=True)]  # fmt: skip
