@@ -220,14 +220,15 @@ class GreedyPolicy(ABC):
         planned: Decision,
         *,
         key: Array,
+        notes: Any = None,
     ) -> tuple[Decision | None, PlannerState, PlanInfo]:
         """Decides again among the best candidates of a decision that was made on an earlier map.
 
-        The decision is None if no path leads to any of them.
+        The decision is None if no path leads to any of them. `notes` are those of `draw`.
         """
         views, before = best_of(planned)
         rule = Rule(
-            lambda situation, *, key: Drawn(views, situation.memory),
+            lambda situation, *, key: Drawn(views, situation.memory, notes),
             functools.partial(self.score_again, before=before),
             self.weigh,
             self.conclude,
@@ -437,14 +438,31 @@ def best_of(planned: Decision) -> tuple[Candidates, np.ndarray]:
 
     Their number is fixed, so that scoring compiles once.
     """
-    finite = np.isfinite(planned.utilities["path"])
-    total = np.where(finite, planned.utilities["total"], -np.inf)
+    order, total = _ranked(planned)
     # A policy that ranks fewer (`r3-ahead`: the beginnings of its best paths) is padded with the
     # first drawn.
-    best = np.argsort(-total, kind="stable")[:RECONSIDERED]
+    best = order[:RECONSIDERED]
     poses = planned.candidates[best]
     views = candidates_along(poses[:, :3, 3], poses[:, :3, 2]).padded(RECONSIDERED)
     return views, np.resize(total[best], RECONSIDERED)
+
+
+def with_others(decision: Decision, planned: Decision) -> Decision:
+    """Adds the candidates of an earlier decision that were not scored again, as of then."""
+    others = _ranked(planned)[0][RECONSIDERED:]
+    utilities = {
+        name: np.concatenate([decision.utilities[name], values[others]])
+        for name, values in planned.utilities.items()
+    }
+    candidates = np.concatenate([decision.candidates, planned.candidates[others]])
+    return replace(decision, candidates=candidates, utilities=utilities)
+
+
+def _ranked(planned: Decision) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the order of a decision's candidates, best first, and their totals, [C] each."""
+    finite = np.isfinite(planned.utilities["path"])
+    total = np.where(finite, planned.utilities["total"], -np.inf)
+    return np.argsort(-total, kind="stable"), total
 
 
 def net_utility(

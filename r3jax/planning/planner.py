@@ -44,7 +44,7 @@ from r3jax.mapping.state import MapState, empty_map
 from r3jax.mapping.tile_files import TILE_MEMORY, open_tile_folder
 from r3jax.mapping.tiles import ACROSS, check_view, whole_map
 from r3jax.mapping.update import integrate_growing
-from r3jax.planning.decide import GreedyPolicy, PlannerState
+from r3jax.planning.decide import GreedyPolicy, PlannerState, with_others
 from r3jax.planning.far import (
     Far,
     arrived,
@@ -445,7 +445,8 @@ def decide_ahead(
 
     Returns:
         As `decide`; None also for a policy without `reconsider`. The policy's memory is only
-        updated by drawing and choosing, not by the path or the view, which have not been taken.
+        updated by drawing and choosing, not by the path or the view, which have not been taken;
+        with tiles, not at all.
     """
     if not isinstance(planner.policy, PlansAhead):
         return None, planner, PlanInfo(DecisionOutcome.NO_CANDIDATE)
@@ -455,7 +456,11 @@ def decide_ahead(
     decision, state, info = planner.policy.decide(
         there.policy_state, map_state, grid, np.asarray(T_next, np.float64), key=key
     )
-    if planner.far is not None:  # its policy keeps nothing, and the camera is not there yet
+    if planner.far is not None:  # its policy keeps nothing: the camera is not there yet
+        if cast(GreedyPolicy, planner.policy).memory_by_cell:
+            viewed, then = there.policy_state.memory, state.memory
+            if np.any(viewed & ~then) or not np.any(then & ~viewed):
+                decision = None  # nothing new at hand: to be decided with what is far away
         return decision, planner, info
     if isinstance(planner.policy_state, PlannerState):
         state = replace(planner.policy_state, memory=state.memory)
@@ -466,6 +471,9 @@ def reconsider(
     planner: Planner, T_world_camera: np.ndarray, planned: Decision, key: Array
 ) -> tuple[Decision | None, Planner, PlanInfo]:
     """Decides again among the best candidates of `decide_ahead`, on the current map.
+
+    With tiles, goals far away are weighed as in `decide`, against all candidates: the best with
+    their current scores, the others with those of `decide_ahead`.
 
     Args:
         planner: the current planner.
@@ -479,10 +487,17 @@ def reconsider(
     policy = planner.policy
     assert isinstance(policy, PlansAhead)  # or `decide_ahead` had decided nothing
     planner = at_hand(planner, T_world_camera[:3, 3])
-    decision, state, info = policy.reconsider(
-        planner.policy_state, planner.map_state, planner.grid, T_world_camera, planned, key=key
-    )
-    return decision, _with_trail(replace(planner, policy_state=state)), info
+    known = planner.policy_state, planner.map_state, planner.grid, T_world_camera, planned
+    if planner.far is None:
+        decision, state, info = policy.reconsider(*known, key=key)
+        return decision, replace(planner, policy_state=state), info
+    decision, state, info = cast(GreedyPolicy, policy).reconsider(*known, key=key, notes=True)
+    after = replace(planner, policy_state=state)
+    if decision is None:
+        return None, after, info
+    every = with_others(decision, planned)
+    best, after, info = _decide_far(planner, after, T_world_camera, every, info)
+    return decision if best is every else best, after, info
 
 
 def tell_policy(planner: Planner, frame: Frame) -> Planner:

@@ -24,7 +24,7 @@ from r3jax.planning.far import (
     with_views,
 )
 from r3jax.planning.far_paths import Coarse
-from r3jax.planning.planner import at_hand, first_map
+from r3jax.planning.planner import at_hand, decide_ahead, first_map, reconsider
 from r3jax.planning.policy import Decision
 from tests.mapping.test_tiles import assert_same_map
 from tests.rooms_of_boxes import frame_in_room, pose_at
@@ -34,6 +34,7 @@ CONFIG = r3jax.MappingConfig(voxel_size=0.1, cell_size=0.25, max_range=3.0)
 HALL = np.array([[0.0, 0.0, 0.0], [30.0, 4.0, 2.6]])
 ENDLESS = np.array([[-np.inf] * 3, [np.inf] * 3])
 KEY = jax.random.key(3)
+ENDS = np.array([[0.5, 0.5, 0.5], [50.0, 0.5, 0.5]])
 
 
 def a_policy(name="r3-pano", **settings):
@@ -249,7 +250,7 @@ def test_a_frontier_far_away_is_a_goal_though_no_view_of_it_was_scored():
     assert weigh_far(arrived(after, end), a_policy(), None, here)[0] is None  # it is tried once
 
 
-def in_a_corridor(name, viewed):
+def in_a_corridor(name, viewed=None):
     """A planner in a corridor of 50 m, neither end of which is known, and where the robot is."""
     planner = r3jax.start(CAMERA, policy=a_policy(name), config=CONFIG, starts=[at_cell(4, 2, 2)])
     far = replace(planner.far, tiles=replace(planner.far.tiles, middle=(0, 0, 9)))
@@ -268,7 +269,7 @@ def in_a_corridor(name, viewed):
     here = at_cell(4, 2, 2)
     grid = far.grid(np.zeros(far.tiles.lattice.shape, np.float32))
     planner = at_hand(replace(planner, far=far, grid=grid), here[:3, 3])
-    memory = np.full(planner.grid.log_odds.shape, viewed)
+    memory = None if viewed is None else np.full(planner.grid.log_odds.shape, viewed)
     return replace(planner, policy_state=replace(planner.policy_state, memory=memory)), here
 
 
@@ -284,6 +285,41 @@ def test_frontier_views_cells_far_away_before_it_starts_over_with_those_at_hand(
     again, after, _ = r3jax.decide(replace(planner, far=tried), here, KEY)
     assert again.length < 3.0
     assert not after.policy_state.memory.all()
+
+
+@pytest.mark.parametrize("name", ["r3", "r3-pano", "r3-ahead"])
+def test_a_far_goal_wins_on_arrival_where_it_would_win_in_a_decision(name):
+    """Nothing has moved since the views at hand were scored."""
+    planner, here = in_a_corridor(name)
+    at_hand_only = (planner.policy_state, planner.map_state, planner.grid, here)
+    planned, _, _ = planner.policy.decide(*at_hand_only, key=KEY)
+    best, goes = planned.utilities["utility"].max(), []
+    place = at_cell(190, 2, 2)[:3, 3]
+    for promise in np.geomspace(0.01, 1e4, 5) * best:
+        far = replace(planner.far, views=a_view(place, place, 0.0, promise), tried=ENDS)
+        with_view = replace(planner, far=far)
+        decided, after, _ = r3jax.decide(with_view, here, KEY)
+        again, later, _ = reconsider(with_view, here, planned, KEY)
+        goes.append(decided.T_world_camera[0, 3] > 40.0)
+        assert (again.T_world_camera[0, 3] > 40.0) == goes[-1]
+        np.testing.assert_array_equal(later.far.goal, after.far.goal)
+        if goes[-1]:
+            np.testing.assert_array_equal(again.waypoints, decided.waypoints)
+    assert goes == sorted(goes)
+    assert goes[-1] > goes[0]
+
+
+def test_frontier_marks_what_it_views_when_it_goes_there_not_when_it_plans_to():
+    planner, here = in_a_corridor("frontier", viewed=False)
+    scoring = planner.policy.config.scoring
+    planned, ahead, _ = decide_ahead(planner, CAMERA, here, KEY, scoring)
+    assert planned.length < 3.0
+    assert not ahead.policy_state.memory.any()
+    decision, after, _ = reconsider(planner, here, planned, KEY)
+    assert decision.length < 3.0
+    assert after.policy_state.memory.any()
+    planner, here = in_a_corridor("frontier", viewed=True)
+    assert decide_ahead(planner, CAMERA, here, KEY, scoring)[0] is None  # all is viewed here
 
 
 def the_ring():
