@@ -42,7 +42,7 @@ class Navigator:
 
     @property
     def is_settled(self) -> bool:
-        """True if Nav2 has answered all that it was asked."""
+        """True if Nav2 has answered every request."""
         return not self._unanswered
 
     def go(self, pose: PoseStamped) -> None:
