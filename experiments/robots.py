@@ -7,7 +7,8 @@ A robot has a footprint, a camera at a height with a tilt and a lens, and nothin
 searched for on the mesh: a raster of 2 cm of everything between 10 cm above the floor and the top
 of the robot, widened by the footprint, and what connects to the start.
 
-*Visited* is what lies within a meter of the robot's path, measured round obstacles.
+*Visited* is what lies within a meter of the robot's path, measured round obstacles. With
+`--settings lidar` it has a LiDAR, too, of which a costmap is made that is trusted where it is free.
 """
 
 import itertools
@@ -43,6 +44,9 @@ NEAR = 1.0
 
 SIZE = (256, 192)
 """Pixels of the images."""
+
+LIDAR = 0.2, 8.0
+"""Height of a LiDAR's plane above the floor, and its range [m]."""
 
 HOUSE = "mesh:experiments/scenes/aws_small_house/aws_small_house.glb"
 
@@ -170,6 +174,29 @@ def after(robot: Robot) -> dict[str, Any]:
     return {"motion": _motion(robot, body=body)}
 
 
+class Lidar:
+    """A LiDAR that sweeps a plane, and the costmap made of its scans."""
+
+    def __init__(self, world: World, floor: float):
+        height, self.reach = LIDAR
+        self.plan = plan_of(world, floor, height - 0.05, height + 0.05)
+        self.costs = np.full(self.plan.distance.shape, -1, np.int8)
+
+    def scan(self, place: np.ndarray) -> np.ndarray:
+        """Adds a scan of 1,440 rays from a place [2] [m]; the costmap, [height, width]."""
+        angles = np.linspace(0.0, 2.0 * np.pi, 1440, endpoint=False)
+        ways = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        steps = np.arange(0.0, self.reach, 0.5 * PIXEL)
+        points = place + steps[:, None, None] * ways
+        at = self.plan.pixel(points.reshape(-1, 2)).reshape(points.shape)
+        hits = self.plan.distance[at[..., 0], at[..., 1]] <= 0.0
+        is_past = np.cumsum(hits, axis=0) > 0
+        free, first = at[~is_past], at[is_past & (np.cumsum(is_past, axis=0) == 1)]
+        self.costs[tuple(free.T)] = 0
+        self.costs[tuple(first.T)] = 100
+        return self.costs.T
+
+
 def _motion(robot: Robot, **body: Any) -> Motion:
     return make_motion("ground", elevations=(robot.tilt, robot.tilt), **body)
 
@@ -198,7 +225,7 @@ def pose_of(robot: Robot, place: np.ndarray, floor: float) -> np.ndarray:
 
 def drive(
     world: World, robot: Robot, settings: dict[str, Any], decisions: int, *, floor: float = 0.0,
-    policy: str = "r3-pano", seed: int = 0,
+    policy: str = "r3-pano", seed: int = 0, lidar: Lidar | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Drives one robot through a world; what it visited, and what it touched."""
     plan = plan_of(world, floor, robot.low, robot.height)
@@ -213,6 +240,9 @@ def drive(
     reason, views = "", [[*pose[:3, 3].round(3).tolist(), *pose[:3, 2].round(3).tolist()]]
     for key in jax.random.split(jax.random.key(seed), decisions):
         planner = r3jax.observe(planner, simulator.render(pose.astype(np.float32)))
+        if lidar is not None:
+            costs, origin = lidar.scan(pose[:2, 3]), lidar.plan.origin
+            planner = r3jax.with_costmap(planner, costs, PIXEL, origin, trust_free=True)
         jax.block_until_ready(planner)  # the frame is in the map before the clock starts
         begin = time.perf_counter()
         decision, planner, info = r3jax.decide(planner, pose, key)
@@ -283,7 +313,7 @@ class Options:
     which: str = "all"
     """`few` or `all`."""
     settings: str = "after"
-    """`before`: the ball of known free cells; `after`: the footprint."""
+    """`before`: the ball of known free cells; `after`: the footprint; `lidar`: a LiDAR, too."""
     out: Annotated[Path, tyro.conf.arg(help="A line of JSON for each drive is added.")] = Path(
         "robots.jsonl"
     )
@@ -304,7 +334,8 @@ def main(options: Options) -> None:
                 continue
             begin = time.perf_counter()
             settings = (before if options.settings == "before" else after)(robot)
-            result = drive(world, robot, settings, options.decisions)
+            lidar = Lidar(world, 0.0) if options.settings == "lidar" else None
+            result = drive(world, robot, settings, options.decisions, lidar=lidar)
             row = {"scene": scene, "settings": options.settings, "robot": asdict(robot), **result}
             with open(options.out, "a") as file:
                 file.write(json.dumps(row) + "\n")

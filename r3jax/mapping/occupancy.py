@@ -58,8 +58,9 @@ VOUCHED_LOG_ODDS = -1.5
 BLOCKS_ACROSS = 64
 """Blocks per image row: 8 pixels of a 512-pixel row, 9 cm at 5 m with 60 degrees of view."""
 
-KEEP_OUT, COSTMAP, REFUSED = 1, 2, 4
-"""Marks of cells: a keep-out zone, an obstacle of a costmap, a goal that was not reached."""
+KEEP_OUT, COSTMAP, REFUSED, TRUSTED = 1, 2, 4, 8
+"""Marks of cells: a keep-out zone, an obstacle of a costmap, a goal that was not reached, and free
+space of a costmap that the robot may enter unseen."""
 
 _OCTANTS = tuple((x, y, z) for x in (-0.25, 0.25) for y in (-0.25, 0.25) for z in (-0.25, 0.25))
 """Centers of a cell's octants, from its center, in cells."""
@@ -84,8 +85,8 @@ class OccupancyGrid(eqx.Module):
     """Mask of the cells that may count as unexplored; None: all."""
 
     marks: UInt8[Array, "X Y Z"] | None = None
-    """Marks of the cells, independent of their log-odds: sums of `KEEP_OUT`, `COSTMAP` and
-    `REFUSED`; None: no marks."""
+    """Marks of the cells, independent of their log-odds: sums of `KEEP_OUT`, `COSTMAP`,
+    `REFUSED` and `TRUSTED`; None: no marks."""
 
     @property
     def closed(self) -> Bool[np.ndarray, "X Y Z"] | None:
@@ -96,6 +97,11 @@ class OccupancyGrid(eqx.Module):
     def refused(self) -> Bool[np.ndarray, "X Y Z"] | None:
         """Cells around goals that were not reached, in which the robot must not stop, or None."""
         return None if self.marks is None else (np.asarray(self.marks) & REFUSED) > 0
+
+    @property
+    def trusted(self) -> Bool[np.ndarray, "X Y Z"] | None:
+        """Cells that a costmap holds for free, which a robot may enter unseen, or None."""
+        return None if self.marks is None else (np.asarray(self.marks) & TRUSTED) > 0
 
     def marked(self, cells: Bool[Array | np.ndarray, "X Y Z"], mark: int) -> "OccupancyGrid":
         """Sets one mark in the given cells, and removes it from all others."""

@@ -13,6 +13,7 @@ Shape symbols: n cells; m columns; v views; X Y Z cells at hand.
 """
 
 import functools
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -659,8 +660,9 @@ def pixel_columns(grid: OccupancyGrid, corners: np.ndarray, resolution: float) -
     """Finds the columns of cells, [X, Y] bool, that pixels overlap, by lower corners [k, 2] [m]."""
     columns = np.zeros(grid.log_odds.shape[:2], bool)
     size, low = float(grid.cell_size), np.asarray(grid.origin, np.float64)[:2]
-    # Both edges of a pixel: every cell that it overlaps is closed.
-    for offset in ((0.01, 0.01), (0.01, 0.99), (0.99, 0.01), (0.99, 0.99)):
+    # Both edges of a pixel, and between them in steps of a cell at most: all cells it overlaps.
+    offsets = np.linspace(0.01, 0.99, max(int(np.ceil(resolution / size)), 1) + 1)
+    for offset in itertools.product(offsets, repeat=2):
         places = corners + resolution * np.array(offset)
         cells = np.floor((places - low) / size).astype(np.int64)
         cells = cells[np.all((cells >= 0) & (cells < columns.shape), axis=1)]

@@ -33,6 +33,7 @@ from r3jax.mapping.occupancy import (
     COSTMAP,
     KEEP_OUT,
     REFUSED,
+    TRUSTED,
     OccupancyGrid,
     empty_grid,
     integrate_depth,
@@ -375,6 +376,7 @@ def with_costmap(
     origin: Sequence[float] | np.ndarray,
     *,
     lethal: int = 100,
+    trust_free: bool = False,
 ) -> Planner:
     """Closes the occupied pixels of a costmap, replacing an earlier costmap.
 
@@ -387,6 +389,10 @@ def with_costmap(
         lethal: pixels of this value or more are closed. Nav2 publishes 100 for obstacles and 99
             where the robot's center would touch them, which r3jax computes itself from the
             footprint.
+        trust_free: a robot with a footprint may enter what all pixels hold for free (0 to below
+            `lethal`), seen by its camera or not: for a camera that does not show the floor near the
+            robot, and a costmap of a LiDAR. What the camera has measured there stays an obstacle.
+            With tiles, until the block moves.
 
     Raises:
         ValueError: another shape, or a resolution that is not positive.
@@ -399,14 +405,20 @@ def with_costmap(
         )
     if not 0.0 < resolution < np.inf:
         raise InputError(f"resolution must be positive [m], got {resolution}")
-    y, x = np.nonzero(costs >= lethal)
-    corners = corner + resolution * np.stack([x, y], axis=1)
+    corners_of = lambda pixels: corner + resolution * np.argwhere(pixels)[:, ::-1]
+    corners = corners_of(costs >= lethal)
     columns = pixel_columns(planner.grid, corners, resolution)
     if planner.far is not None:
         far = replace(planner.far, costs=(corners, resolution))
         planner = replace(planner, far=with_closed_columns(far))
-    cells = np.broadcast_to(columns[:, :, None], planner.grid.log_odds.shape)
-    return replace(planner, grid=planner.grid.marked(cells, COSTMAP))
+    fill = lambda columns: np.broadcast_to(columns[:, :, None], planner.grid.log_odds.shape)
+    trusted = np.zeros_like(columns)
+    if trust_free:
+        is_free = (costs >= 0) & (costs < lethal)
+        trusted = pixel_columns(planner.grid, corners_of(is_free), resolution)
+        trusted &= ~pixel_columns(planner.grid, corners_of(~is_free), resolution)
+    grid = planner.grid.marked(fill(columns), COSTMAP).marked(fill(trusted), TRUSTED)
+    return replace(planner, grid=grid)
 
 
 @checked(planner=a_planner)

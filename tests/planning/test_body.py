@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from r3jax.geometry.cameras import Camera
-from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.occupancy import TRUSTED, OccupancyGrid
 from r3jax.planning.decide import driven_pixels
 from r3jax.planning.robot.body import Body
 from r3jax.planning.robot.motion import make_motion, motion_of_record
@@ -271,6 +271,24 @@ def test_the_landing_of_a_stair_is_the_floor():
     voxels = np.concatenate([landing, below])
     room = room_for(Body(0.2), grid_of(all_free()), voxels, VOXEL, pose_at(1.0, 2.0, 1.0 + HEIGHT))
     assert room.floor[6, 11] == pytest.approx(1.0, abs=VOXEL)
+
+
+def test_what_a_costmap_holds_for_free_is_entered_unseen_but_not_what_was_measured_there():
+    free = np.zeros(SHAPE, bool)
+    free[3:6, 10:13] = True  # round the robot; nothing else is known
+    trusted = np.zeros(SHAPE, bool)
+    trusted[3:12, 9:14] = True
+    body, pose = Body(0.2, floor=0.0), pose_at(0.8, 2.0)
+    place = np.array([[1.9, 2.0]])
+    plan = lambda grid, voxels: room_for(body, grid, voxels, VOXEL, pose)
+    grid = grid_of(free)
+    assert not plan(grid, np.zeros((0, 3))).fits(place).any()
+    known = grid.marked(trusted, TRUSTED)
+    room = plan(known, np.zeros((0, 3)))
+    assert room.fits(place).all()
+    assert np.isfinite(room.cost[9, 11])
+    assert not np.isfinite(room.cost[13:]).any()
+    assert not plan(known, pole(1.9, 2.0)).fits(place).any()
 
 
 def test_a_polygon_needs_the_room_to_turn():

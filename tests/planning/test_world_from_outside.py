@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import ndimage
 
 import r3jax
 from r3jax.geometry.cameras import look_at
@@ -105,6 +106,41 @@ def test_a_costmap_lies_as_ros_has_it():
     assert not again.grid.closed.any()
     with pytest.raises(ValueError, match="height"):
         r3jax.with_costmap(planner, data.ravel(), 0.1, [0.0, 0.0])
+
+
+@given(
+    resolution=st.floats(0.03, 1.2),
+    origin=st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)),
+    seed=st.integers(0, 99),
+)
+@settings(max_examples=40, deadline=None)
+def test_every_column_under_a_pixel_is_closed_and_one_under_free_pixels_alone_trusted(
+    resolution, origin, seed
+):
+    """Whatever the edge of a pixel, larger than a cell, too."""
+    data = np.random.default_rng(seed).choice([-1, 0, 50, 100], size=(9, 11)).astype(np.int8)
+    grid = r3jax.with_costmap(planner_in(), data, resolution, origin, trust_free=True).grid
+    closed, trusted = grid.closed.any(axis=2), grid.trusted.any(axis=2)
+
+    def under(pixels: np.ndarray) -> np.ndarray:
+        """Columns that some of 40 x 40 points inside of each pixel lie in."""
+        rows, columns = np.nonzero(pixels)
+        inside = np.linspace(0.02, 0.98, 40)
+        x, y = np.meshgrid(inside, inside)
+        points = np.stack([columns[:, None] + x.ravel(), rows[:, None] + y.ravel()], axis=-1)
+        places = np.array(origin) + resolution * points - np.asarray(grid.origin)[:2]
+        cells = np.floor(places.reshape(-1, 2) / 0.2).astype(int)
+        found = np.zeros(closed.shape, bool)
+        found[tuple(cells[np.all((cells >= 0) & (cells < closed.shape), axis=1)].T)] = True
+        return found
+
+    assert closed[under(data == 100)].all()
+    assert not trusted[under((data == 100) | (data == -1))].any()
+    is_free = (data == 0) | (data == 50)
+    assert under(is_free)[trusted].all()
+    assert trusted[under(is_free) & ~ndimage.binary_dilation(under(~is_free))].all()
+    untrusted = r3jax.with_costmap(planner_in(), data, resolution, origin)
+    assert not untrusted.grid.trusted.any()
 
 
 def test_zones_and_costmap_do_not_undo_each_other():

@@ -11,7 +11,7 @@ above, like Nav2's obstacle layer, and computes the distance of each point to al
 - what is not known. A column of cells is known if all that the body takes up of it is free, a
   pixel of it also if the floor was seen there: the voxels say what stands beside it. A voxel says
   nothing of the rest of its cell: behind the seen side of a wall is its other side. Where the robot
-  has stood and driven is known, too.
+  has stood and driven is known, too, and what a trusted costmap holds for free.
 
 Cells below the camera that it cannot see count as `unknown_below` says.
 
@@ -165,13 +165,15 @@ def room_for(
     known = _Known.of(body, grid, voxels, voxel_size, T_world_camera, been.trail)
     low, pixel, position = known.origin[:2], known.pixel, known.position[:2]
     passable = known.passable(camera, T_world_camera, been.views)
+    if grid.trusted is not None:
+        passable |= known.by_pixel(np.any(grid.trusted, axis=2))
     own = np.hypot(*known.round_place(position)[1:])
     # Where the robot stands is known, whatever the cells say; but no zone ends under it.
     is_own = own <= body.needed + pixel
     thin = known.thin
     solid = known.by_pixel(thin) & ~is_own
     if grid.closed is not None:
-        solid |= known.by_pixel(grid.closed.any(axis=2))
+        solid |= known.by_pixel(np.any(grid.closed, axis=2))
     # The robot is not inside of anything: what seems to be there is itself, or noise.
     places = known.obstacles[:, :2]
     places = places[np.linalg.norm(places - position, axis=1) > body.radius]
@@ -280,7 +282,8 @@ class _Known:
     def by_column(self, pixels: np.ndarray) -> np.ndarray:
         """Finds columns with one of these pixels [x, y] at least, [X, Y]."""
         x, y = self.free.shape[:2]
-        return pixels.reshape(x, PIXELS_PER_CELL, y, PIXELS_PER_CELL).any(axis=(1, 3))
+        by_cell = pixels.reshape(x, PIXELS_PER_CELL, y, PIXELS_PER_CELL)
+        return np.any(by_cell, axis=(1, 3))
 
     def round_place(
         self, place: np.ndarray, reach: float = math.inf

@@ -344,7 +344,8 @@ class ExplorerNode(Node):
             self.planner = r3jax.refuse(self.planner, self.chosen)
         if self.costmap is not None and self.costmap.is_aligned:
             layer = self.costmap.cost, self.costmap.resolution, self.costmap.origin
-            self.planner = r3jax.with_costmap(self.planner, *layer)
+            trusts = self.settings.trust_costmap
+            self.planner = r3jax.with_costmap(self.planner, *layer, trust_free=trusts)
         decision, self.planner, info = r3jax.decide(self.planner, here.T_world_camera, key)
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self.settings.world_frame)
         self.clouds.publish(cloud_of(header, *voxel_points(self.planner.map_state)))

@@ -59,6 +59,9 @@ class Settings:
     occupied_cost: int = 99
     """Cells of the costmap with at least this cost are no goals [0 to 100]."""
 
+    trust_costmap: bool = False
+    """Enter what the costmap holds for free, seen by the camera or not."""
+
     navigate_action: str = "navigate_to_pose"
     """Name of Nav2's action."""
 
