@@ -52,7 +52,7 @@ from r3jax.mapping.tiles import (
 )
 from r3jax.planning.candidates import candidates_along
 from r3jax.planning.config import PlannerConfig
-from r3jax.planning.decide import GreedyPolicy, PlannerState, look_round
+from r3jax.planning.decide import RECONSIDERED, GreedyPolicy, PlannerState, look_round
 from r3jax.planning.far_paths import (
     Coarse,
     Lengths,
@@ -440,15 +440,18 @@ def _renewed(known: Known, policy: GreedyPolicy, middle: Tile, position: np.ndar
         _, situation = look_round(memory, map_state, grid, here, policy.config)
     except InputError:  # that place lies out of the heights that are allowed now
         return kept
-    offered = candidates_along(both.position, both.pose[:, :3, 2])
-    scored, values = policy.score(situation, offered.padded(most), key=jax.random.key(0))
-    if "utility" not in values:
-        return views
-    num = len(both.path)
-    pose = scored.T_world_camera[:num]
-    renewed = {name: np.asarray(x)[:num] for name, x in values.items()}
-    fresh = Views(pose, both.place, both.path, renewed)
-    return _joined(kept, fresh.take(scored.valid[:num] & (renewed["utility"] > 0.0)))
+    parts: list[Views] = []
+    for i in range(0, len(both.path), RECONSIDERED):
+        some = both.take(np.arange(i, min(i + RECONSIDERED, len(both.path))))
+        offered = candidates_along(some.position, some.pose[:, :3, 2]).padded(RECONSIDERED)
+        scored, values = policy.score(situation, offered, key=jax.random.key(0))
+        if "utility" not in values:
+            return views
+        num = len(some.path)
+        renewed = {name: np.asarray(x)[:num] for name, x in values.items()}
+        fresh = Views(scored.T_world_camera[:num], some.place, some.path, renewed)
+        parts.append(fresh.take(scored.valid[:num] & (renewed["utility"] > 0.0)))
+    return functools.reduce(_joined, parts, kept)
 
 
 def _in_block(far: Far, positions: np.ndarray) -> np.ndarray:

@@ -256,6 +256,10 @@ def decide(
     after = replace(planner, policy_state=policy_state)
     if planner.far is None:
         return decision, after, info
+    if decision is not None and not planner.far.coarse.tiles:
+        # For its programs: the same score views when the block moves, which must not wait for them.
+        known = planner.policy_state, planner.map_state, planner.grid, pose, decision
+        cast(GreedyPolicy, planner.policy).reconsider(*known, key=key)
     return _decide_far(planner, after, pose, decision, info)
 
 

@@ -10,6 +10,7 @@ import pytest
 
 import r3jax
 from r3jax.errors import InputError, PathError
+from r3jax.exploration.state import compilations
 from r3jax.mapping.tiles import packed_layer, page, unpacked_layer, whole_map
 from r3jax.mapping.update import integrate_growing
 from r3jax.planning.far import (
@@ -250,9 +251,9 @@ def test_a_frontier_far_away_is_a_goal_though_no_view_of_it_was_scored():
     assert weigh_far(arrived(after, end), a_policy(), None, here)[0] is None  # it is tried once
 
 
-def in_a_corridor(name, viewed=None):
+def in_a_corridor(policy, viewed=None):
     """A planner in a corridor of 50 m, neither end of which is known, and where the robot is."""
-    planner = r3jax.start(CAMERA, policy=a_policy(name), config=CONFIG, starts=[at_cell(4, 2, 2)])
+    planner = r3jax.start(CAMERA, policy=policy, config=CONFIG, starts=[at_cell(4, 2, 2)])
     far = replace(planner.far, tiles=replace(planner.far.tiles, middle=(0, 0, 9)))
     free = a_box((0, 0, 0), (200, 4, 4))
     far = known(far, free)
@@ -274,10 +275,10 @@ def in_a_corridor(name, viewed=None):
 
 
 def test_frontier_views_cells_far_away_before_it_starts_over_with_those_at_hand():
-    planner, here = in_a_corridor("frontier", viewed=False)
+    planner, here = in_a_corridor(a_policy("frontier"), viewed=False)
     first, _, _ = r3jax.decide(planner, here, KEY)
     assert first.length < 3.0
-    planner, here = in_a_corridor("frontier", viewed=True)
+    planner, here = in_a_corridor(a_policy("frontier"), viewed=True)
     decision, after, _ = r3jax.decide(planner, here, KEY)
     assert decision.T_world_camera[0, 3] > 45.0
     np.testing.assert_array_equal(after.policy_state.memory, True)
@@ -290,7 +291,7 @@ def test_frontier_views_cells_far_away_before_it_starts_over_with_those_at_hand(
 @pytest.mark.parametrize("name", ["r3", "r3-pano", "r3-ahead"])
 def test_a_far_goal_wins_on_arrival_where_it_would_win_in_a_decision(name):
     """Nothing has moved since the views at hand were scored."""
-    planner, here = in_a_corridor(name)
+    planner, here = in_a_corridor(a_policy(name))
     at_hand_only = (planner.policy_state, planner.map_state, planner.grid, here)
     planned, _, _ = planner.policy.decide(*at_hand_only, key=KEY)
     best, goes = planned.utilities["utility"].max(), []
@@ -310,7 +311,7 @@ def test_a_far_goal_wins_on_arrival_where_it_would_win_in_a_decision(name):
 
 
 def test_frontier_marks_what_it_views_when_it_goes_there_not_when_it_plans_to():
-    planner, here = in_a_corridor("frontier", viewed=False)
+    planner, here = in_a_corridor(a_policy("frontier"), viewed=False)
     scoring = planner.policy.config.scoring
     planned, ahead, _ = decide_ahead(planner, CAMERA, here, KEY, scoring)
     assert planned.length < 3.0
@@ -318,8 +319,23 @@ def test_frontier_marks_what_it_views_when_it_goes_there_not_when_it_plans_to():
     decision, after, _ = reconsider(planner, here, planned, KEY)
     assert decision.length < 3.0
     assert after.policy_state.memory.any()
-    planner, here = in_a_corridor("frontier", viewed=True)
+    planner, here = in_a_corridor(a_policy("frontier"), viewed=True)
     assert decide_ahead(planner, CAMERA, here, KEY, scoring)[0] is None  # all is viewed here
+
+
+def test_nothing_is_compiled_when_the_block_moves_and_leaves_views_behind():
+    scoring = r3jax.ScoringConfig(max_range=3.0, panorama_bins=150)  # no other test compiles this
+    policy = r3jax.make_policy("r3-pano", scoring=scoring, num_candidates=12, num_frontier=6)
+    planner, here = in_a_corridor(policy)
+    far = replace(planner.far, coarse=Coarse(planner.far.tiles.lattice))
+    _, planner, _ = r3jax.decide(replace(planner, far=far), here, KEY)
+    left = a_view([0.1, 0.6, 0.6], here[:3, 3], 1.0, 5.0)
+    before = compilations.count
+    away = at_hand(
+        replace(planner, far=replace(planner.far, views=left)), here[:3, 3] + [4.0, 0, 0]
+    )
+    assert compilations.count == before > 0
+    assert away.far.views.values["utility"][0] not in (0.0, 5.0)  # scored once more
 
 
 def the_ring():
