@@ -58,12 +58,14 @@ from r3jax.planning.far_paths import (
     Lengths,
     cell_of,
     clearance_of,
+    coarse_arrays,
     connected_within,
     known_cells,
     lengths_from,
     path_along,
     refreshed,
     with_closed,
+    with_summaries,
 )
 from r3jax.planning.policy import Decision, LivesOutside, Policy
 from r3jax.planning.robot.limits import Limits, angles_along, rotations
@@ -389,7 +391,10 @@ def with_coarse(far: Far, grid: OccupancyGrid, memory: PlannerState, config: Pla
     for tile in lattice.block(far.tiles.middle):
         low = np.array(tile) * size - far.first_cell
         now[tile] = cells[tuple(slice(a, a + n) for a, n in zip(low, size, strict=True))]
-    # Of a planner that was loaded, or where zones have changed.
+    clearance = clearance_of(config, start)
+    if far.coarse.tiles and far.coarse.clearance != clearance:  # a fork with another robot
+        far = replace(far, coarse=replace(far.coarse, tiles={}, links={}))
+    # Of a planner that was merged, or where zones have changed.
     for tile in far.tiles.cells.keys() - far.coarse.tiles.keys():
         layers = far.tiles.cells[tile]
         none = np.zeros(lattice.cells, np.float32)
@@ -397,7 +402,6 @@ def with_coarse(far: Far, grid: OccupancyGrid, memory: PlannerState, config: Pla
         now[tile] = known_cells(
             found.get("log_odds", none), found.get("looks", none), found.get("memory")
         )
-    clearance = clearance_of(config, start)
     return replace(far, coarse=refreshed(far.coarse, now, far.trails, clearance, far.box))
 
 
@@ -684,6 +688,7 @@ def far_arrays(far: Far) -> dict[str, np.ndarray]:
     views = far.views
     arrays |= {"views.pose": views.pose, "views.place": views.place, "views.path": views.path}
     arrays |= {f"values.{name}": x for name, x in views.values.items()}
+    arrays |= {f"coarse.{name}": x for name, x in coarse_arrays(far.coarse).items()}
     return arrays | {f"zones.{i}": zone for i, zone in enumerate(far.zones)}
 
 
@@ -714,7 +719,10 @@ def far_of(arrays: Mapping[str, np.ndarray], config: MappingConfig, camera: Came
     if "goal" in arrays:  # not in planners saved by earlier versions
         mask = arrays["mask.corner"], float(arrays["mask.edge"])
         far = replace(far, mask=mask, goal=arrays["goal"], tried=arrays["tried"])
-    return with_closed_columns(far)
+    far = with_closed_columns(far)
+    if "coarse.tile" not in arrays:  # filled with the next decision
+        return far
+    return replace(far, coarse=with_summaries(far.coarse, under("coarse.")))
 
 
 def merged_far(fars: Sequence[Far], tiles: Tiles) -> Far:

@@ -61,6 +61,9 @@ _TRIED_STOPS = 16
 _LEG = 8.0
 """A path is made exact piece by piece, of about this extent [m]."""
 
+_CELLS = "cells", "node", "steps"
+"""Fields of a tile's summary that have a number for each cell."""
+
 _BATCH = 64
 """Tiles that are summarized together."""
 
@@ -275,6 +278,52 @@ def with_closed(coarse: Coarse, columns: np.ndarray) -> Coarse:
         if tile in tiles and _next(tile, axis) in tiles
     }
     return replace(coarse, tiles=tiles, links=links, closed=closed)
+
+
+def coarse_arrays(coarse: Coarse) -> dict[str, np.ndarray]:
+    """Lists the coarse level as arrays, to be stored: the inverse of `with_summaries`."""
+    names, links = sorted(coarse.tiles), sorted(coarse.links)
+    tiles = [coarse.tiles[name] for name in names]
+    edges = [coarse.links[name] for name in links]
+    margin, heights, body, only_trail = coarse.clearance
+    arrays = {"tile": np.array(names, np.int64).reshape(-1, 3),
+              "link": np.array([(*tile, axis) for tile, axis in links], np.int64).reshape(-1, 4),
+              "clearance": np.array([margin, *heights, body, only_trail])}  # fmt: skip
+    if not tiles:
+        return arrays
+    arrays |= {name: np.stack([getattr(x, name) for x in tiles]) for name in _CELLS}
+    parts = {"centers": [x.centers for x in tiles]}
+    for name, some in (("edges", [x.edges for x in tiles]), ("links", edges)):
+        parts |= {f"{name}.ends": [x.ends.T for x in some], f"{name}.length": [x[1] for x in some]}
+    for name in ("frontier", "goals"):
+        for i, field_name in enumerate(Goals._fields):
+            parts[f"{name}.{field_name}"] = [getattr(x, name)[i] for x in tiles]
+    for name, some in parts.items():
+        if some:
+            arrays |= {name: np.concatenate(some), f"{name}.num": np.array([len(x) for x in some])}
+    return arrays
+
+
+def with_summaries(coarse: Coarse, arrays: Mapping[str, np.ndarray]) -> Coarse:
+    """Fills a coarse level, in which columns are closed already, with stored summaries."""
+    if not len(arrays["tile"]):
+        return coarse
+    of = lambda name: np.split(arrays[name], np.cumsum(arrays[f"{name}.num"])[:-1])
+    edges_of = lambda name: [
+        Edges(ends.T, length) for ends, length in zip(of(f"{name}.ends"), of(f"{name}.length"),
+                                                      strict=True)]  # fmt: skip
+    goals_of = lambda name: map(Goals, *(of(f"{name}.{field}") for field in Goals._fields))
+    parts = zip(*(arrays[name] for name in _CELLS), of("centers"), edges_of("edges"),
+                goals_of("frontier"), goals_of("goals"), strict=True)  # fmt: skip
+    names = [(x, y, z) for x, y, z in arrays["tile"].tolist()]
+    links = [((x, y, z), axis) for x, y, z, axis in arrays["link"].tolist()]
+    margin, low, high, body, only_trail = arrays["clearance"].tolist()
+    return replace(
+        coarse,
+        clearance=Clearance(margin, (low, high), body, bool(only_trail)),
+        tiles={name: CoarseTile(*part) for name, part in zip(names, parts, strict=True)},
+        links=dict(zip(links, edges_of("links"), strict=True)) if links else {},
+    )
 
 
 def refreshed(

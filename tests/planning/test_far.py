@@ -24,7 +24,7 @@ from r3jax.planning.far import (
     with_coarse,
     with_views,
 )
-from r3jax.planning.far_paths import Coarse
+from r3jax.planning.far_paths import Coarse, coarse_arrays
 from r3jax.planning.planner import at_hand, decide_ahead, first_map, reconsider
 from r3jax.planning.policy import Decision
 from tests.mapping.test_tiles import assert_same_map
@@ -508,3 +508,28 @@ def test_what_is_known_of_far_places_can_be_stored():
     for name in first:
         np.testing.assert_array_equal(first[name], second[name])
     assert again.tiles.lattice == far.tiles.lattice
+
+
+def test_a_loaded_coarse_level_is_used_as_it_is_by_the_same_robot_only():
+    zone = np.array([[30.0, 0.4], [30.6, 0.4], [30.6, 0.7], [30.0, 0.7]])
+    far = updated(with_closed_columns(replace(the_ring(), zones=(zone,))))
+    again = far_of(far_arrays(far), CONFIG, CAMERA)
+    assert again.coarse.tiles.keys() == far.coarse.tiles.keys()
+    after = updated(again)
+    for tile, summary in again.coarse.tiles.items():
+        assert after.coarse.tiles[tile] is summary
+    for other in (updated(replace(again, coarse=replace(again.coarse, tiles={}, links={}))), after):
+        assert_same_coarse(other.coarse, far.coarse)
+    wider = a_policy(safety_margin=0.6)
+    assert_same_coarse(updated(again, policy=wider).coarse, updated(far, policy=wider).coarse)
+    num_open = lambda coarse: sum(int((x.node >= 0).sum()) for x in coarse.tiles.values())
+    assert num_open(updated(again, policy=wider).coarse) < num_open(far.coarse)
+    old = {name: x for name, x in far_arrays(far).items() if not name.startswith("coarse.")}
+    assert_same_coarse(updated(far_of(old, CONFIG, CAMERA)).coarse, far.coarse)
+
+
+def assert_same_coarse(a, b):
+    arrays, others = coarse_arrays(a), coarse_arrays(b)
+    assert arrays.keys() == others.keys()
+    for name, values in arrays.items():
+        np.testing.assert_array_equal(values, others[name])
