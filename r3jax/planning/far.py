@@ -331,7 +331,7 @@ def check_policy(policy: Policy, policy_state: Any) -> None:
         not jax.tree.leaves(state.memory) or getattr(kind, "memory_by_cell", False)
     )
     weighs = getattr(kind, "weigh", None) is GreedyPolicy.weigh
-    weighs |= getattr(kind, "weigh_far", None) is not getattr(GreedyPolicy, "weigh_far", None)
+    weighs |= getattr(kind, "weigh_far", None) is not GreedyPolicy.weigh_far
     if not is_plain or not weighs or isinstance(policy, LivesOutside):
         raise InputError(
             f"the policy {policy.name!r} has a memory or a measure of its own for the whole place, "
