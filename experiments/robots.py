@@ -190,10 +190,10 @@ class Lidar:
         points = place + steps[:, None, None] * ways
         at = self.plan.pixel(points.reshape(-1, 2)).reshape(points.shape)
         hits = self.plan.distance[at[..., 0], at[..., 1]] <= 0.0
-        is_past = np.cumsum(hits, axis=0) > 0
-        free, first = at[~is_past], at[is_past & (np.cumsum(is_past, axis=0) == 1)]
-        self.costs[tuple(free.T)] = 0
-        self.costs[tuple(first.T)] = 100
+        is_free = np.cumsum(hits, axis=0) == 0
+        is_first = hits & (np.cumsum(hits, axis=0) == 1)
+        self.costs[tuple(at[is_free].T)] = 0
+        self.costs[tuple(at[is_first].T)] = 100
         return self.costs.T
 
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from r3jax.formats.poses import MAX_DISTANCE
 
-MAX_GAP = 1_000_000_000
+_MAX_GAP = 1_000_000_000
 """Samples of tf farther than this from a time say nothing about it [ns]."""
 
 _MAX_HOLD = 50_000_000
@@ -43,7 +43,7 @@ class Edge:
     rotations: list[np.ndarray] = field(default_factory=list[np.ndarray])
     """Quaternions x y z w, frame to parent, [4] each."""
 
-    def at(self, times: np.ndarray, max_gap: float = MAX_GAP) -> tuple[np.ndarray, np.ndarray]:
+    def at(self, times: np.ndarray, max_gap: float = _MAX_GAP) -> tuple[np.ndarray, np.ndarray]:
         """Interpolates transforms `T_parent_frame` [n, 4, 4], and marks the known ones [n].
 
         Args:

@@ -168,7 +168,7 @@ def room_for(
     if grid.trusted is not None:
         passable |= known.by_pixel(np.any(grid.trusted, axis=2))
     own = np.hypot(*known.round_place(position)[1:])
-    # Where the robot stands is known, whatever the cells say; but no zone ends under it.
+    # Where the robot stands is known and open, whatever the cells say, unless a zone closes it.
     is_own = own <= body.needed + pixel
     thin = known.thin
     solid = known.by_pixel(thin) & ~is_own
