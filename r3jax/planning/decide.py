@@ -627,8 +627,9 @@ def explain_confinement(situation: Situation, config: PlannerConfig) -> tuple[st
         counts = travel.room.counts | extra
         assert isinstance(body, Body)
         advice = (
-            "the camera does not show the floor near the robot: tilt it down, or allow "
-            "`Body(unknown_below=...)`, or raise the lowest part (`Body(heights=...)`)"
+            "the camera does not show the floor near the robot: tilt it down, allow "
+            "`Body(unknown_below=...)`, raise the lowest part (`Body(heights=...)`), or trust a "
+            "LiDAR's costmap (`with_costmap(..., trust_free=True)`)"
             if counts["unknown"] > counts["obstacle"]
             else "give a smaller footprint or margin, or move the robot to an open place"
         )

@@ -13,8 +13,7 @@ Shape symbols: n cells; m columns; v views; X Y Z cells at hand.
 """
 
 import functools
-import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -51,6 +50,7 @@ from r3jax.mapping.tiles import (
     with_arrays,
 )
 from r3jax.planning.candidates import candidates_along
+from r3jax.planning.columns import Plane, cells_of, pixel_columns, polygon_columns
 from r3jax.planning.config import PlannerConfig
 from r3jax.planning.decide import RECONSIDERED, GreedyPolicy, PlannerState, look_round
 from r3jax.planning.far_paths import (
@@ -153,14 +153,9 @@ class Far:
     trails: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.int64))
     """Cells that the robot has come through, counted from tile (0, 0, 0), [n, 3]."""
 
-    zones: tuple[np.ndarray, ...] = ()
-    """Polygons that no robot may enter, [k, 2] each [m]."""
-
-    costs: tuple[np.ndarray, float] = (np.zeros((0, 2)), 0.0)
-    """Lower corners of a costmap's closed pixels, [k, 2] [m], and their edge [m]."""
-
-    mask: tuple[np.ndarray, float] = (np.zeros((0, 2)), 0.0)
-    """Lower corners of columns that no robot may enter, [k, 2] [m], and their edge [m]."""
+    columns: Mapping[int, np.ndarray] = field(default_factory=dict[int, np.ndarray])
+    """Columns of cells that zones and a costmap close or vouch for, counted from tile (0, 0, 0),
+    [k, 2] int64 each; by mark (`KEEP_OUT`, `COSTMAP`, `TRUSTED`)."""
 
     refused: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
     """Goals that could not be reached, and the radii round them, [k, 4] [m]."""
@@ -250,8 +245,14 @@ class Far:
         ends = np.array([np.floor(box[0] - 0.5 + 1e-6), np.ceil(box[1] + 0.5 - 1e-6)])
         return np.where(np.array(lattice.num) > 1, ends, [np.zeros(3), np.array(lattice.cells)])
 
+    @property
+    def plane(self) -> Plane:
+        """The lattice of columns, counted from tile (0, 0, 0), within the box."""
+        lattice = self.tiles.lattice
+        return Plane(np.array(lattice.origin)[:2], lattice.cell_size, self.box_cells[:, :2])
+
     def grid(self, log_odds: np.ndarray) -> OccupancyGrid:
-        """Makes the grid at hand of its cells: with the limits, zones and marks that lie in it."""
+        """Makes the grid at hand of its cells: with the limits and marks that lie in it."""
         lattice = self.tiles.lattice
         corner = lattice.corner(self.tiles.middle)
         grid = OccupancyGrid(
@@ -276,12 +277,11 @@ class Far:
         # One structure for all blocks: another one would be compiled for.
         if np.isfinite(self.box[:, is_cut]).any():
             grid = replace(grid, explorable=jnp.asarray(inside))
-        columns = pixel_columns(grid, *self.mask)
-        for zone in self.zones:
-            columns |= columns_in(grid, zone)
-        fill = lambda columns: np.broadcast_to(columns[:, :, None], lattice.shape)
-        grid = grid.marked(~stops, REFUSED).marked(fill(columns), KEEP_OUT)
-        return grid.marked(fill(pixel_columns(grid, *self.costs)), COSTMAP)
+        grid = grid.marked(~stops, REFUSED)
+        for mark, columns in self.columns.items():
+            cells = cells_of(columns - self.first_cell[:2], lattice.shape)
+            grid = grid.marked(cells, mark)
+        return grid
 
 
 def first_far(
@@ -625,71 +625,24 @@ def arrived(far: Far, here: np.ndarray) -> Far:
     return replace(far, trails=np.concatenate([far.trails, np.array(cells)]))
 
 
-def with_closed_columns(far: Far) -> Far:
-    """Closes the columns of zones, masks and costmaps on the coarse level, after they changed."""
-    lattice = far.tiles.lattice
-    origin, size = np.array(lattice.origin), lattice.cell_size
-    areas: list[tuple[np.ndarray, Callable[[OccupancyGrid], np.ndarray]]]
-    areas = [(zone, functools.partial(columns_in, corners=zone)) for zone in far.zones]
-    for corners, edge in (far.mask, far.costs):
-        if len(corners):
-            columns_of = functools.partial(pixel_columns, corners=corners, resolution=edge)
-            areas.append((np.concatenate([corners, corners + edge]), columns_of))
-    found = [np.zeros((0, 2), np.int64)]
-    for points, columns_of in areas:
-        low = np.floor((points.min(axis=0) - origin[:2]) / size).astype(np.int64)
-        num = np.ceil((points.max(axis=0) - origin[:2]) / size).astype(np.int64) - low
-        grid = OccupancyGrid(
-            jnp.asarray(np.zeros((*num, 1), np.float32)),
-            jnp.asarray(origin + np.append(low, 0) * size, jnp.float32),
-            jnp.asarray(size, jnp.float32),
-        )
-        found.append(np.argwhere(columns_of(grid)) + low)
-    return replace(far, coarse=with_closed(far.coarse, np.concatenate(found)))
-
-
-def columns_in(grid: OccupancyGrid, corners: np.ndarray) -> np.ndarray:
-    """Finds the columns of cells that a polygon [k, 2] [m] overlaps, [X, Y] bool."""
-    size, origin = float(grid.cell_size), np.asarray(grid.origin, np.float64)
-    num = 4  # zones thinner than a quarter of a cell may be missed
-    x, y = (
-        origin[i] + size / num * (np.arange(num * grid.log_odds.shape[i]) + 0.5) for i in range(2)
-    )
-    inside = np.zeros((len(x), len(y)), bool)
-    for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        if ay != by:  # the even-odd rule: each edge to the right of a point flips its state
-            crosses = (ay > y) != (by > y)
-            inside ^= crosses & (x[:, None] < ax + (y - ay) * (bx - ax) / (by - ay))
-    return np.asarray(inside.reshape(len(x) // num, num, len(y) // num, num).any(axis=(1, 3)))
-
-
-def pixel_columns(grid: OccupancyGrid, corners: np.ndarray, resolution: float) -> np.ndarray:
-    """Finds the columns of cells, [X, Y] bool, that pixels overlap, by lower corners [k, 2] [m]."""
-    columns = np.zeros(grid.log_odds.shape[:2], bool)
-    size, low = float(grid.cell_size), np.asarray(grid.origin, np.float64)[:2]
-    # Both edges of a pixel, and between them in steps of a cell at most: all cells it overlaps.
-    offsets = np.linspace(0.01, 0.99, max(int(np.ceil(resolution / size)), 1) + 1)
-    for offset in itertools.product(offsets, repeat=2):
-        places = corners + resolution * np.array(offset)
-        cells = np.floor((places - low) / size).astype(np.int64)
-        cells = cells[np.all((cells >= 0) & (cells < columns.shape), axis=1)]
-        columns[tuple(cells.T)] = True
-    return columns
+def with_columns(far: Far, columns: Mapping[int, np.ndarray]) -> Far:
+    """Replaces the columns of some marks, and closes theirs on the coarse level."""
+    columns = {**far.columns, **columns}
+    none = np.zeros((0, 2), np.int64)
+    closed = np.concatenate([columns.get(mark, none) for mark in (KEEP_OUT, COSTMAP)])
+    return replace(far, columns=columns, coarse=with_closed(far.coarse, closed))
 
 
 def far_arrays(far: Far) -> dict[str, np.ndarray]:
     """Lists all that is known of far places as arrays, to be stored."""
     arrays = {f"tiles.{name}": x for name, x in arrays_of(far.tiles).items()}
     arrays |= {"box": far.box, "border": np.array(far.border), "trails": far.trails,
-               "refused": far.refused, "costs.corner": far.costs[0],
-               "costs.edge": np.array(far.costs[1]), "mask.corner": far.mask[0],
-               "mask.edge": np.array(far.mask[1]), "goal": far.goal,
-               "tried": far.tried}  # fmt: skip
+               "refused": far.refused, "goal": far.goal, "tried": far.tried}  # fmt: skip
     views = far.views
     arrays |= {"views.pose": views.pose, "views.place": views.place, "views.path": views.path}
     arrays |= {f"values.{name}": x for name, x in views.values.items()}
     arrays |= {f"coarse.{name}": x for name, x in coarse_arrays(far.coarse).items()}
-    return arrays | {f"zones.{i}": zone for i, zone in enumerate(far.zones)}
+    return arrays | {f"columns.{mark}": x for mark, x in far.columns.items()}
 
 
 def far_of(arrays: Mapping[str, np.ndarray], config: MappingConfig, camera: Camera) -> Far:
@@ -703,7 +656,6 @@ def far_of(arrays: Mapping[str, np.ndarray], config: MappingConfig, camera: Came
         name.removeprefix(prefix): x for name, x in arrays.items() if name.startswith(prefix)
     }
     lattice = lattice_for(config, camera, arrays["box"])
-    zones = under("zones.")
     far = Far(
         tiles=with_arrays(Tiles(lattice, (0, 0, 0), config.capacity), under("tiles."), _KINDS),
         box=arrays["box"],
@@ -712,17 +664,30 @@ def far_of(arrays: Mapping[str, np.ndarray], config: MappingConfig, camera: Came
         views=Views(*(arrays[f"views.{name}"] for name in ("pose", "place", "path")),
                     values=under("values.")),
         trails=arrays["trails"],
-        zones=tuple(zones[name] for name in sorted(zones, key=int)),
-        costs=(arrays["costs.corner"], float(arrays["costs.edge"])),
         refused=arrays["refused"],
     )  # fmt: skip
     if "goal" in arrays:  # not in planners saved by earlier versions
-        mask = arrays["mask.corner"], float(arrays["mask.edge"])
-        far = replace(far, mask=mask, goal=arrays["goal"], tried=arrays["tried"])
-    far = with_closed_columns(far)
+        far = replace(far, goal=arrays["goal"], tried=arrays["tried"])
+    columns = {int(mark): x for mark, x in under("columns.").items()}
+    far = with_columns(far, columns | _earlier_columns(far, arrays, under("zones.").values()))
     if "coarse.tile" not in arrays:  # filled with the next decision
         return far
     return replace(far, coarse=with_summaries(far.coarse, under("coarse.")))
+
+
+def _earlier_columns(
+    far: Far, arrays: Mapping[str, np.ndarray], zones: Iterable[np.ndarray]
+) -> dict[int, np.ndarray]:
+    """Finds the columns that a planner saved by an earlier version has as polygons and pixels."""
+    if "costs.corner" not in arrays:
+        return {}
+    pixels = lambda name: (
+        pixel_columns(far.plane, arrays[f"{name}.corner"], float(arrays[f"{name}.edge"]))
+        if f"{name}.corner" in arrays
+        else np.zeros((0, 2), np.int64)
+    )
+    kept_out = [pixels("mask"), *(polygon_columns(far.plane, zone) for zone in zones)]
+    return {KEEP_OUT: np.concatenate(kept_out), COSTMAP: pixels("costs")}
 
 
 def merged_far(fars: Sequence[Far], tiles: Tiles) -> Far:
@@ -738,10 +703,10 @@ def merged_far(fars: Sequence[Far], tiles: Tiles) -> Far:
         tiles=tiles,
         views=functools.reduce(_joined, (far.views for far in fars)),
         trails=np.unique(np.concatenate([far.trails for far in fars]), axis=0),
-        zones=tuple(zone for far in fars for zone in far.zones),
         refused=np.unique(np.concatenate([far.refused for far in fars]), axis=0),
         tried=np.concatenate([far.tried for far in fars]),
-        mask=(np.concatenate([far.mask[0] for far in fars]), max(far.mask[1] for far in fars)),
         coarse=Coarse(first.tiles.lattice),  # filled with the next decision
     )
-    return with_closed_columns(merged)
+    none = np.zeros((0, 2), np.int64)
+    kept_out = np.concatenate([far.columns.get(KEEP_OUT, none) for far in fars])
+    return with_columns(merged, {KEEP_OUT: np.unique(kept_out, axis=0)})

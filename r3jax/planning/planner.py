@@ -45,18 +45,17 @@ from r3jax.mapping.state import MapState, empty_map
 from r3jax.mapping.tile_files import TILE_MEMORY, open_tile_folder
 from r3jax.mapping.tiles import ACROSS, check_view, whole_map
 from r3jax.mapping.update import integrate_growing
+from r3jax.planning.columns import Plane, cells_of, pixel_columns, polygon_columns, without
 from r3jax.planning.decide import GreedyPolicy, PlannerState, with_others
 from r3jax.planning.far import (
     Far,
     arrived,
     check_policy,
-    columns_in,
     first_far,
     moved_to,
-    pixel_columns,
     weigh_far,
-    with_closed_columns,
     with_coarse,
+    with_columns,
     with_views,
 )
 from r3jax.planning.policy import Decision, DecisionOutcome, PlanInfo, PlansAhead, Policy
@@ -346,30 +345,41 @@ def keep_out(planner: Planner, zones: Iterable[Any] | np.ndarray) -> Planner:
     Raises:
         ValueError: not a polygon, or a mask of another shape.
     """
-    shape = planner.grid.log_odds.shape
-    polygons: list[np.ndarray] = []
-    columns, size = np.zeros(shape[:2], bool), float(planner.grid.cell_size)
-    mask = np.zeros((0, 2))
+    shape, (plane, first) = planner.grid.log_odds.shape, _plane_of(planner)
     if isinstance(zones, np.ndarray) and zones.dtype == bool:
         if zones.shape != shape[:2]:
             raise InputError(f"the mask must be [X, Y] = {list(shape[:2])}, got {zones.shape}")
-        columns = zones
-        mask = np.asarray(planner.grid.origin, np.float64)[:2] + size * np.argwhere(zones)
-    else:
-        for zone in zones:
-            corners = np.asarray(zone, np.float64)
-            if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
-                raise InputError(
-                    f"a zone is a polygon of at least three corners [k, 2] in meters, got shape "
-                    f"{corners.shape}"
-                )
-            columns |= columns_in(planner.grid, corners)
-            polygons.append(corners)
+        return _with_columns(planner, {KEEP_OUT: np.argwhere(zones) + first})
+    found = [np.zeros((0, 2), np.int64)]
+    for zone in zones:
+        corners = np.asarray(zone, np.float64)
+        if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
+            raise InputError(
+                f"a zone is a polygon of at least three corners [k, 2] in meters, got shape "
+                f"{corners.shape}"
+            )
+        if not np.isfinite(corners).all():
+            raise InputError(f"corners of a zone must be finite, got {corners.tolist()}")
+        found.append(polygon_columns(plane, corners))
+    return _with_columns(planner, {KEEP_OUT: np.concatenate(found)})
+
+
+def _plane_of(planner: Planner) -> tuple[Plane, np.ndarray]:
+    """Returns the lattice of the planner's columns, and the first column at hand, [2]."""
     if planner.far is not None:
-        far = replace(planner.far, zones=tuple(polygons), mask=(mask, size))
-        planner = replace(planner, far=with_closed_columns(far))
-    cells = np.broadcast_to(columns[:, :, None], shape)
-    return replace(planner, grid=planner.grid.marked(cells, KEEP_OUT))
+        return planner.far.plane, planner.far.first_cell[:2]
+    grid, first = planner.grid, np.zeros(2, np.int64)
+    window = np.array([first, grid.log_odds.shape[:2]], np.float64)
+    return Plane(np.asarray(grid.origin, np.float64)[:2], float(grid.cell_size), window), first
+
+
+def _with_columns(planner: Planner, columns: dict[int, np.ndarray]) -> Planner:
+    """Replaces the columns [k, 2] of some marks, at hand and far away."""
+    grid, (_, first) = planner.grid, _plane_of(planner)
+    for mark, found in columns.items():
+        grid = grid.marked(cells_of(found - first, grid.log_odds.shape), mark)
+    far = None if planner.far is None else with_columns(planner.far, columns)
+    return replace(planner, grid=grid, far=far)
 
 
 @checked(planner=a_planner)
@@ -396,7 +406,6 @@ def with_costmap(
         trust_free: a robot with a footprint may enter what all pixels hold for free (0 to below
             `lethal`), seen by its camera or not: for a camera that does not show the floor near the
             robot, and a costmap of a LiDAR. What the camera has measured there stays an obstacle.
-            With tiles, until the block moves.
 
     Raises:
         ValueError: another shape, or a resolution that is not positive.
@@ -410,19 +419,16 @@ def with_costmap(
     if not 0.0 < resolution < np.inf:
         raise InputError(f"resolution must be positive [m], got {resolution}")
     corners_of = lambda pixels: corner + resolution * np.argwhere(pixels)[:, ::-1]
-    corners = corners_of(costs >= lethal)
-    columns = pixel_columns(planner.grid, corners, resolution)
-    if planner.far is not None:
-        far = replace(planner.far, costs=(corners, resolution))
-        planner = replace(planner, far=with_closed_columns(far))
-    fill = lambda columns: np.broadcast_to(columns[:, :, None], planner.grid.log_odds.shape)
-    trusted = np.zeros_like(columns)
+    plane, _ = _plane_of(planner)
+    closed = pixel_columns(plane, corners_of(costs >= lethal), resolution)
+    trusted = np.zeros((0, 2), np.int64)
     if trust_free:
         is_free = (costs >= 0) & (costs < lethal)
-        trusted = pixel_columns(planner.grid, corners_of(is_free), resolution)
-        trusted &= ~pixel_columns(planner.grid, corners_of(~is_free), resolution)
-    grid = planner.grid.marked(fill(columns), COSTMAP).marked(fill(trusted), TRUSTED)
-    return replace(planner, grid=grid)
+        free, others = (
+            pixel_columns(plane, corners_of(pixels), resolution) for pixels in (is_free, ~is_free)
+        )
+        trusted = without(free, others)
+    return _with_columns(planner, {COSTMAP: closed, TRUSTED: trusted})
 
 
 @checked(planner=a_planner)

@@ -7,12 +7,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import r3jax
 from r3jax.errors import InputError, PathError
 from r3jax.exploration.state import compilations
+from r3jax.mapping.occupancy import COSTMAP, KEEP_OUT, TRUSTED
 from r3jax.mapping.tiles import packed_layer, page, unpacked_layer, whole_map
 from r3jax.mapping.update import integrate_growing
+from r3jax.planning.columns import pixel_columns, polygon_columns
 from r3jax.planning.far import (
     Views,
     arrived,
@@ -20,8 +24,8 @@ from r3jax.planning.far import (
     far_of,
     first_far,
     weigh_far,
-    with_closed_columns,
     with_coarse,
+    with_columns,
     with_views,
 )
 from r3jax.planning.far_paths import Coarse, coarse_arrays
@@ -112,7 +116,7 @@ def test_a_view_left_far_away_is_gone_back_to_over_the_way_that_was_come():
     assert len(there.views.path) == 0  # a promise is taken once
 
 
-@pytest.mark.parametrize("kind", ["zone", "costmap", "mask", "refused"])
+@pytest.mark.parametrize("kind", ["zone", "costmap", "refused"])
 def test_no_path_leads_through_what_was_closed_since(kind):
     far = on_trail(far_at([0.1, 0.1, 0.1]), way((0, 0, 0), (200, 0, 0)))
     place = np.array([200.5, 0.5, 0.5]) * 0.25
@@ -120,13 +124,14 @@ def test_no_path_leads_through_what_was_closed_since(kind):
     here = np.eye(4)
     here[:3, 3] = 0.125
     assert weigh_far(far, a_policy(), None, here)[0] is not None
-    closed = {
-        "zone": {"zones": (np.array([[20.0, -1.0], [21.0, -1.0], [21.0, 1.0], [20.0, 1.0]]),)},
-        "costmap": {"costs": (np.array([[20.0, 0.0]]), 0.3)},
-        "mask": {"mask": (np.array([[20.0, 0.0]]), 0.25)},
-        "refused": {"refused": np.array([[*place, 0.5]])},
-    }
-    after = updated(with_closed_columns(replace(far, **closed[kind])))
+    corners = np.array([[20.0, -1.0], [21.0, -1.0], [21.0, 1.0], [20.0, 1.0]])
+    if kind == "refused":
+        far = replace(far, refused=np.array([[*place, 0.5]]))
+    elif kind == "zone":
+        far = with_columns(far, {KEEP_OUT: polygon_columns(far.plane, corners)})
+    else:
+        far = with_columns(far, {COSTMAP: pixel_columns(far.plane, np.array([[20.0, 0.0]]), 0.3)})
+    after = updated(far)
     assert weigh_far(after, a_policy(), None, here)[0] is None
 
 
@@ -188,7 +193,8 @@ def test_limits_zones_and_refusals_are_drawn_into_every_block():
     lattice = far.tiles.lattice
     assert lattice.num == (5, 5, 1)
     zone = np.array([[6.0, 1.0], [7.0, 1.0], [7.0, 2.0], [6.0, 2.0]])
-    far = replace(far, zones=(zone,), refused=np.array([[5.0, 0.0, 1.0, 0.6]]))
+    far = with_columns(far, {KEEP_OUT: polygon_columns(far.plane, zone)})
+    far = replace(far, refused=np.array([[5.0, 0.0, 1.0, 0.6]]))
     for middle in ((1, 0, 0), (2, 0, 0)):
         moved = replace(far, tiles=replace(far.tiles, middle=middle))
         grid = moved.grid(np.zeros(lattice.shape, np.float32))
@@ -500,8 +506,8 @@ def test_a_hall_is_explored_to_its_end_by_tiles(tmp_path):
 
 def test_what_is_known_of_far_places_can_be_stored():
     far = replace(far_at([0.0, 0.0, 0.0]), trails=way((0, 0, 0), (4, 0, 0)))
-    far = replace(far, views=a_view([3.0, 0.0, 0.0], [0, 0, 0], 3.0, 7.0),
-                  zones=(np.zeros((3, 2)), np.ones((4, 2))))  # fmt: skip
+    far = replace(far, views=a_view([3.0, 0.0, 0.0], [0, 0, 0], 3.0, 7.0))
+    far = with_columns(far, {KEEP_OUT: np.array([[3, 4], [-5, 6]]), TRUSTED: np.array([[1, 2]])})
     again = far_of(far_arrays(far), CONFIG, CAMERA)
     first, second = far_arrays(far), far_arrays(again)
     assert first.keys() == second.keys()
@@ -510,9 +516,40 @@ def test_what_is_known_of_far_places_can_be_stored():
     assert again.tiles.lattice == far.tiles.lattice
 
 
+def test_zones_and_costmaps_of_earlier_versions_are_read():
+    far = far_at([0.0, 0.0, 0.0])
+    zone, pixels = np.array([[3.0, 4.0], [5.0, 4.0], [5.0, 6.0]]), np.array([[1.0, 1.0]])
+    arrays = {n: x for n, x in far_arrays(far).items() if not n.startswith("columns.")}
+    arrays |= {"zones.0": zone, "costs.corner": pixels, "costs.edge": np.array(0.5)}
+    again = far_of(arrays, CONFIG, CAMERA)
+    np.testing.assert_array_equal(again.columns[KEEP_OUT], polygon_columns(far.plane, zone))
+    np.testing.assert_array_equal(again.columns[COSTMAP], pixel_columns(far.plane, pixels, 0.5))
+    assert len(again.coarse.closed) > 0
+
+
+@given(
+    columns=st.lists(st.tuples(st.integers(-90, 90), st.integers(-90, 90)), max_size=20),
+    x=st.floats(-9.0, 9.0),
+    mark=st.sampled_from([KEEP_OUT, COSTMAP, TRUSTED]),
+)
+@settings(max_examples=20, deadline=None)
+def test_marks_stay_where_they_are_when_the_block_moves(columns, x, mark):
+    """At every block, the marked columns lie at the same places in the world."""
+    far = with_columns(far_at([0.0, 0.0, 0.0]), {mark: np.array(columns, np.int64).reshape(-1, 2)})
+    lattice, middle = far.tiles.lattice, far.tiles.lattice.tiles_of(np.array([[x], [0.0], [0.0]]))
+    far = replace(far, tiles=replace(far.tiles, middle=tuple(middle[:, 0].tolist())))
+    grid, first = far.grid(np.zeros(lattice.shape, np.float32)), far.first_cell[:2]
+    marked = np.argwhere(((np.asarray(grid.marks) & mark) > 0).all(axis=2))
+    places = np.asarray(grid.origin, np.float64)[:2] + (marked + 0.5) * lattice.cell_size
+    found = np.floor((places - lattice.origin[:2]) / lattice.cell_size).astype(int)
+    is_at_hand = lambda column: np.all((column >= first) & (column < first + lattice.shape[:2]))
+    assert set(map(tuple, found.tolist())) == {c for c in columns if is_at_hand(np.array(c))}
+
+
 def test_a_loaded_coarse_level_is_used_as_it_is_by_the_same_robot_only():
     zone = np.array([[30.0, 0.4], [30.6, 0.4], [30.6, 0.7], [30.0, 0.7]])
-    far = updated(with_closed_columns(replace(the_ring(), zones=(zone,))))
+    far = the_ring()
+    far = updated(with_columns(far, {KEEP_OUT: polygon_columns(far.plane, zone)}))
     again = far_of(far_arrays(far), CONFIG, CAMERA)
     assert again.coarse.tiles.keys() == far.coarse.tiles.keys()
     after = updated(again)

@@ -12,7 +12,7 @@ from scipy import ndimage
 import r3jax
 from r3jax.geometry.cameras import look_at
 from r3jax.mapping.occupancy import empty_grid, integrate_rays
-from r3jax.planning.far import columns_in
+from r3jax.planning.columns import Plane, polygon_columns
 from r3jax.planning.robot.motion import make_motion
 
 BOUNDS = np.array([[0.0, 0.0, 0.0], [4.0, 3.0, 2.0]])
@@ -66,7 +66,10 @@ def test_no_path_enters_a_zone_until_it_is_opened():
 @settings(max_examples=50, deadline=None)
 def test_a_polygon_closes_the_columns_that_it_holds_points_of(corners):
     grid, polygon = empty_grid(BOUNDS), np.array(corners)
-    columns = columns_in(grid, polygon)
+    shape = grid.log_odds.shape[:2]
+    plane = Plane(np.asarray(grid.origin, np.float64)[:2], 0.2, np.array([(0, 0), shape], float))
+    columns = np.zeros(shape, bool)
+    columns[tuple(polygon_columns(plane, polygon).T)] = True
     cells = np.argwhere(np.ones(columns.shape, bool))
     found = np.zeros(columns.shape, bool)
     for dx in (0.125, 0.375, 0.625, 0.875):

@@ -151,14 +151,19 @@ def closed_loop(module, node):
     np.testing.assert_array_equal(voxels(node), before)
     node.callbacks["path"](path_message(module, [shift @ T for T in robot], times))
     assert node.said == [f"loop closed: mapping {NUM} key frames again"]
+    assert node.goal is None  # the next timer decides anew
+    corner = costmap_message(module, np.full((1, 1), 100, np.int8), 0.3, *BOUNDS[:2])
+    node.on_costmap(corner)
+    node.decide()  # the planner of before gets it, and the new one, too
     wait([node.rebuilding[0]])
     node.swap()
+    node.decide()
+    assert node.planner.grid.closed.any()
     np.testing.assert_allclose(
         [f.T_world_camera for f in node.frames], [shift @ pose for pose in poses], atol=1e-9
     )
     expected = before + np.array([1.0, 0.0, 0.0])
     np.testing.assert_allclose(voxels(node).mean(axis=0), expected.mean(axis=0), atol=0.02)
-    assert node.goal is None  # the next timer decides anew
 
 
 def test_images_wait_for_their_transforms_and_key_frames_for_a_move(module, tmp_path, monkeypatch):

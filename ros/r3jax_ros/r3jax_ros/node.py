@@ -65,7 +65,8 @@ class ExplorerNode(Node):
         super().__init__("r3jax")
         self.settings = settings = declared(self)
         self.bounds = np.reshape(settings.bounds, (2, 3))
-        self.running, self.costmap, self.growth = settings.autostart, None, GrowthAhead()
+        self.running, self.growth = settings.autostart, GrowthAhead()
+        self.costmap, self.drawn = None, None  # the latest, and the one that the planner has
         self.pages, self.mapper = contextlib.ExitStack(), ThreadPoolExecutor(1)
         self.pending, self.frames, self.track = deque(maxlen=10), [], None
         self.info, self.planner, self.goal, self.decisions = None, None, None, 0
@@ -191,7 +192,7 @@ class ExplorerNode(Node):
             self.planner, self.rebuilding = r3jax.load(self.map_file), None
             # Its key frames are not in the file: a closure moves what comes from now on.
             self.frames, self.goal, self.track, self.has_news = [], None, None, False
-            self.chosen = None
+            self.chosen, self.drawn = None, None
             self.navigator.cancel()
 
         return self._tried(response, "loaded", load)
@@ -284,7 +285,7 @@ class ExplorerNode(Node):
     def swap(self) -> None:
         """Takes the rebuilt planner, and maps what has come in meanwhile."""
         (task, num), self.rebuilding = self.rebuilding, None
-        self.planner, self.has_news = task.result(), True
+        self.planner, self.has_news, self.drawn = task.result(), True, None
         if self.page is not None:
             for key_frame in self.frames[:num]:
                 self.page.passed(self.to_frame(key_frame))
@@ -342,10 +343,11 @@ class ExplorerNode(Node):
         self.has_news, self.decisions = False, self.decisions + 1
         if self.chosen is not None and self.navigator.state == "failed":
             self.planner = r3jax.refuse(self.planner, self.chosen)
-        if self.costmap is not None and self.costmap.is_aligned:
+        if self.costmap is not self.drawn and self.costmap.is_aligned:
             layer = self.costmap.cost, self.costmap.resolution, self.costmap.origin
             trusts = self.settings.trust_costmap
             self.planner = r3jax.with_costmap(self.planner, *layer, trust_free=trusts)
+            self.drawn = self.costmap
         decision, self.planner, info = r3jax.decide(self.planner, here.T_world_camera, key)
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self.settings.world_frame)
         self.clouds.publish(cloud_of(header, *voxel_points(self.planner.map_state)))
