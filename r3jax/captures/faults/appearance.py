@@ -146,6 +146,9 @@ def _directions(image: BlockImage, blocks: np.ndarray) -> np.ndarray:
     return offset / np.linalg.norm(offset, axis=1, keepdims=True)
 
 
+FAST = 0.25
+"""Image motion between two frames that counts as fast, as a share of the width."""
+
 _LARGEST_TURN = np.radians(60.0)
 """Between frames that follow each other [rad]."""
 
@@ -155,7 +158,9 @@ def image_motion(images: Sequence[BlockImage]) -> np.ndarray:
 
     A turn by an angle moves it by the focal length times as much; a step by that over the depth.
     Each frame has the larger of the motions before and after it; a single frame has 0. A larger
-    turn than a video has is no motion: views of one 360 photo, or pictures of another pass.
+    turn than a video has is no motion: views of one 360 photo, or pictures of another pass. Nor is
+    that between single photos, most of which lie farther apart than frames of a fast video: each
+    was taken standing still, maybe in another order.
     """
     speed = np.zeros(len(images))
     for i, (a, b) in enumerate(pairwise(images)):
@@ -166,7 +171,8 @@ def image_motion(images: Sequence[BlockImage]) -> np.ndarray:
         step = float(np.linalg.norm(a.pose[:3, 3] - b.pose[:3, 3])) / depth
         moved = float(a.camera.fx) * (turn + step) / a.camera.width
         speed[i], speed[i + 1] = max(speed[i], moved), max(speed[i + 1], moved)
-    return speed
+    is_video = len(speed) > 0 and np.median(speed) < FAST
+    return speed if is_video else np.zeros(len(images))
 
 
 @dataclass(frozen=True)

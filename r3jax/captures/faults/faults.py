@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from r3jax.captures.faults.appearance import (
+    FAST,
     Light,
     Sharpness,
     image_motion,
@@ -36,9 +37,6 @@ HoloLens visibly blurred frames have 0.26 to 0.48, and visibly sharp ones 0.45 a
 _SMEARED = 0.6
 """Detail kept along one direction over that along another, below which a blur has a direction:
 0.2 to 0.35 after a motion of 3 to 9 pixels, 0.8 to 1 in sharp frames."""
-
-_FAST = 0.25
-"""Image motion between two frames that counts as fast, as a share of the width."""
 
 _NEAR = 0.25
 """Minimum focus distance of phones [m]."""
@@ -259,7 +257,7 @@ def _blur(sharp: Sharpness, images: Sequence[BlockImage], names: _Names) -> list
     """Finds blurred frames, by their likely cause."""
     motion = image_motion(images)
     is_blurred = np.nan_to_num(sharp.share, nan=1.0) < BLURRED
-    moved = is_blurred & ((sharp.lost_along < _SMEARED) | (motion > _FAST))
+    moved = is_blurred & ((sharp.lost_along < _SMEARED) | (motion > FAST))
     out: list[Finding | None] = []
     for kind, mask in (("blur", moved), ("focus", is_blurred & ~moved)):
         numbers = [int(i) for i in np.argsort(sharp.share) if mask[i]]
@@ -270,7 +268,7 @@ def _blur(sharp: Sharpness, images: Sequence[BlockImage], names: _Names) -> list
             f"{100 * sharp.share[i]:.0f} % of the detail"
             + (
                 f"; the picture moved by {100 * motion[i]:.0f} % of its width"
-                if kind == "blur" and motion[i] > _FAST
+                if kind == "blur" and motion[i] > FAST
                 else "; smeared along one direction"
                 if kind == "blur"
                 else "; nearer than 25 cm"

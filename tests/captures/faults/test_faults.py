@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from r3jax.captures.faults.appearance import image_motion
 from r3jax.captures.faults.blocks import block_image
 from r3jax.captures.faults.faults import Faults, faults_of, find_faults
 from r3jax.captures.source import source_of
@@ -77,6 +78,13 @@ def test_a_frame_that_a_known_motion_blurred_is_found_alone(axis, pixels):
     rgb = to_bytes(ndimage.uniform_filter1d(own_rgb(), pixels, axis=axis))
     (finding,) = damaged(rgb).findings
     assert (finding.kind, finding.frames) == ("blur", (DAMAGED,))
+
+
+def test_single_photos_do_not_move():
+    """From one photo to the next nothing is said of how fast the camera was."""
+    assert np.all(image_motion(blocks(walk())) > 0.05)
+    assert np.all(image_motion(blocks(walk()[::4])) == 0.0)
+    assert np.all(image_motion(blocks(walk()[:8] + walk()[-1:]))[-2:] > 0.5)
 
 
 def test_a_frame_out_of_focus_is_found():
