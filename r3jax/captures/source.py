@@ -32,6 +32,7 @@ from r3jax.formats.posed_images import PosedImages, Reconstruction
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.runs.reader import Run
+from r3jax.validation.files import printable
 
 
 class SamplingTable(NamedTuple):
@@ -375,7 +376,7 @@ def _of_images(images: PosedImages, name: str) -> Source:
     with naming(images.path):
         for lens in set(images.lenses):
             sampling_table(lens, stride)  # refuses unknown lenses
-    labels = tuple(path.name for path in images.image_paths)
+    labels = tuple(printable(path.name) for path in images.image_paths)
     has_images = images.has_images
     remark = images.remark
     if not has_images:
@@ -389,6 +390,7 @@ def _of_images(images: PosedImages, name: str) -> Source:
     if hidden := _hidden_share(images) if has_images else 0.0:
         masked = f"Masks hide {100 * hidden:.0f} % of the pictures."
         remark = masked if remark is None else f"{remark} {masked}"
+    remark = None if remark is None else printable(remark)
     photograph = (lambda index, by: _photograph(images, index, by)) if has_images else None
     if any(path is not None for path in images.depth_paths):
         is_camera = not images.is_stereo

@@ -159,3 +159,8 @@ def _namesake(path: Path) -> Path:
         return path
     others = (path.with_suffix(path.suffix.lower()), path.with_suffix(path.suffix.upper()))
     return next((other for other in others if os.path.exists(other)), path)
+
+
+def printable(text: str) -> str:
+    """Replaces bytes of file names that are not UTF-8, as other systems' archives leave them."""
+    return os.fsencode(text).decode(errors="replace")

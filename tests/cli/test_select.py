@@ -1,5 +1,6 @@
 """`r3jax select`, as a user meets it: reduced captures that other programs read."""
 
+import dataclasses
 import json
 import os
 import shutil
@@ -14,6 +15,7 @@ from r3jax.captures.camera_paths import write_camera_path
 from r3jax.cli.console import Stages
 from r3jax.cli.main import main
 from r3jax.formats.captures import open_capture
+from r3jax.formats.colmap.binary import write_binary
 from r3jax.formats.colmap.reader import find_model, read_model
 from r3jax.formats.nerfstudio import read_transforms
 from tests.apps.audit.room import (
@@ -85,6 +87,28 @@ def test_a_colmap_model_keeps_what_its_images_still_see(captures, tmp_path):
     for name in kept:
         assert (out / "images" / name).read_bytes() == (capture / "images" / name).read_bytes()
         assert not (out / "images" / name).is_symlink()
+
+
+def test_a_reduced_model_keeps_its_masks_and_names_that_are_not_utf8(captures, tmp_path):
+    """An archive from a Windows that writes file names in Latin-1."""
+    capture, out = shutil.copytree(captures / "colmap", tmp_path / "capture"), tmp_path / "out"
+    model = read_model(find_model(capture))
+    latin = lambda name: os.fsdecode(b"K\xfcche " + name.encode())
+    images = tuple(dataclasses.replace(i, name=latin(i.name)) for i in model.images)
+    for old, new in zip(model.images, images, strict=True):
+        (capture / "images" / old.name).rename(capture / "images" / new.name)
+    write_binary(find_model(capture), dataclasses.replace(model, images=images))
+    mask = np.full((LENS.height, LENS.width), 255, np.uint8)
+    mask[:20] = 0
+    (capture / "masks").mkdir()
+    Image.fromarray(mask).save(capture / "masks" / f"{images[0].name}.png")
+    keep = f"K\ufffdche {model.images[0].name}"
+    assert select(capture, out, "--surfaces", "points", "--frames", "3", "--keep", keep) == 0
+    assert keep in record_of(out)["kept"]
+    again = open_capture(out).source
+    at = [path.name for path in again.image_paths].index(images[0].name)
+    np.testing.assert_array_equal(again.masked_rgb(at)[1], mask > 0)
+    assert "K\ufffdche" in (out / "selection.html").read_text()
 
 
 def tracks(model):

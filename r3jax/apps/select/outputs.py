@@ -154,6 +154,7 @@ def _reduce_transforms(
         for key in _PATHS:
             if isinstance(name := frame.get(key), str):
                 files.take(name, below(path.parent, name))
+        _take_mask(source, index, path.parent, files)
         on_frame()
     if isinstance(points := content.get("ply_file_path"), str):
         files.take(points, below(path.parent, points))
@@ -181,6 +182,13 @@ def _take_split(path: Path, files: _Files) -> None:
         name = below(path.parent, frame["file_path"])
         for candidate in (name, name.with_name(f"{name.name}.png")):
             files.take(_relative(candidate, path.parent), candidate)
+
+
+def _take_mask(source: PosedImages, index: int, folder: Path, files: _Files) -> None:
+    """Links the mask of an image, which lies in `folder` even if no file names it."""
+    mask = None if source.mask_paths is None else source.mask_paths[index]
+    if mask is not None:
+        files.take(_relative(mask, folder), mask)
 
 
 def _relative(path: Path, folder: Path) -> str:
@@ -213,6 +221,7 @@ def _reduce_model(
             files.take(f"images/{image.name}", original)
         for copy in COPIES:
             files.take(f"images{copy}/{image.name}", root.with_name(plain + copy) / image.name)
+        _take_mask(source, index, root.parent, files)
         on_frame()
     is_binary = (model_folder / "cameras.bin").exists()
     for name in ("cameras", "images", "points3D"):

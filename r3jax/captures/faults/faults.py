@@ -28,6 +28,7 @@ from r3jax.captures.faults.blocks import BlockImage, block_image, overlaps
 from r3jax.captures.faults.offsets import Offsets, Systematic, offsets
 from r3jax.captures.source import Source
 from r3jax.formats.errors import FormatError
+from r3jax.validation.files import printable
 
 BLURRED = 0.45
 """Less of its neighbors' detail than this, and a frame is blurred: a motion of 3 pixels at the
@@ -154,7 +155,9 @@ def find_faults(
         raise next(iter(failed.values()))
     kept = np.setdiff1d(chosen, list(failed))
     found = faults_of(images, kept, source.labels, source.is_metric, source.has_images, fits=fits)
-    left_out = {index: f"{error.path.name}: {error.reason}" for index, error in failed.items()}
+    left_out = {
+        index: f"{printable(error.path.name)}: {error.reason}" for index, error in failed.items()
+    }
     return dataclasses.replace(found, left_out=left_out, without_depth=tuple(without_depth))
 
 
