@@ -56,8 +56,8 @@ _DO = {
 """Remedy of each cause in a word or two."""
 
 GOOD, _AGAIN = 0.85, 0.3
-"""Shares seen well enough: above the first a capture is good for splats, below the second it should
-be taken again."""
+"""Shares seen well enough: above the first a capture is good for splats, below the second, a share
+of what is known, it should be taken again. A white table is no fault of the pictures."""
 
 _LEAST_PROMISE = 0.5
 """Minimum gain that is reported as a gain [percent]."""
@@ -197,19 +197,19 @@ def _surfaces(audit: Audit) -> str:
     parts = [f"{100 * shares[c]:.0f} % is seen {SHORT[c]}" for c in ordered if shares[c] >= 0.005]
     fine = f"{100 * cause_share(audit, 'fine'):.0f} %"
     if audit.source.is_complete:
-        start = f"{fine} of {audit.places.seen_from}"
+        start = f"{fine} of {audit.places.seen_from} is"
     else:
         what = "pictures" if audit.is_own_path else "frames"
         start = (
             f"There is no depth camera: depth comes from {_DEPTH_FROM[audit.source.kind]}. "
-            f"{fine} of the pixels of the {what}"
+            f"{fine} of the pixels of the {what} are"
         )
         if audit.shares["unseen"] >= 0.005:
             by = "no other picture" if audit.is_own_path else "no picture"
             parts.append(f"{100 * audit.shares['unseen']:.0f} % is shown by {by}")
         parts.append(f"{_unknown(audit)} is not known ({MEANING[NOT_KNOWN]})")
     well = f"R ≥ {FINE:g}" + ("" if audit.source.has_images else ", if colors agree")
-    return f"{start} is seen well enough ({well})" + (f"; {listed(parts)}." if parts else ".")
+    return f"{start} seen well enough ({well})" + (f"; {listed(parts)}." if parts else ".")
 
 
 def _promises(audit: Audit) -> list[str]:
@@ -239,7 +239,8 @@ def promised(audit: Audit) -> str:
     count = len(audit.plan.views)
     these = "This picture" if count == 1 else f"These {count} pictures"
     if not audit.source.is_complete:
-        return f"How much {these[:1].lower()}{these[1:]} would add is not known without depth."
+        these = these[:1].lower() + these[1:]
+        return f"How much {these} would add is not known without a depth camera."
     now = 100 * audit.diagnosis.fine_share
     low, middle, high = (100 * share for share in promise(audit.plan))
     if middle - now < _LEAST_PROMISE:
@@ -439,7 +440,8 @@ def state(audit: Audit) -> str:
     if survey.doubt is not None or survey.is_one_place or not faults.fits:
         return "again"
     fine = cause_share(audit, "fine")
-    if fine < _AGAIN or _posed_share(audit) < _MOST:
+    known = 1.0 if audit.source.is_complete else 1.0 - audit.shares[NOT_KNOWN]
+    if fine < _AGAIN * known or _posed_share(audit) < _MOST:
         return "again"
     return "good" if fine >= GOOD and not _severe(audit) else "gaps"
 
@@ -470,7 +472,7 @@ def headline(audit: Audit) -> str:
     if audit.source.is_complete:
         return f"{words}: {fine} of {audit.places.seen_from} is seen well enough.{but}"
     return (
-        f"{words}: {fine} of the pictures' pixels is seen well enough, {_unknown(audit)} is not "
+        f"{words}: {fine} of the pictures' pixels are seen well enough, {_unknown(audit)} is not "
         f"known.{but}"
     )
 

@@ -24,6 +24,7 @@ from r3jax.apps.audit.sentences import (
     CONTRADICTED,
     method,
     saturation,
+    state,
     verdict,
 )
 from r3jax.apps.audit.settings import AuditSettings
@@ -162,6 +163,14 @@ def test_the_verdict_says_what_speaks_against_the_numbers(corner, cloud):
         frames = [replace(f, score=replace(f.score, renderability=value)) for f in corner.frames]
         said = " ".join(verdict(replace(corner, frames=tuple(frames))))
         assert (saturation() in said) == is_saturated
+
+
+def test_only_what_is_known_can_say_that_a_capture_must_start_again(cloud):
+    """A small object on a white table: most pixels have no depth, and the others are fine."""
+    for fine, rare, said in ((0.2, 0.1, "gaps"), (0.05, 0.25, "again")):
+        shares = dict.fromkeys(cloud.shares, 0.0) | {"fine": fine, "rare": rare, NOT_KNOWN: 0.7}
+        frames = [replace(f, score=replace(f.score, shares=shares)) for f in cloud.frames]
+        assert state(replace(cloud, frames=tuple(frames))) == said
 
 
 def test_a_gain_is_what_all_surfaces_gain_together(corner):
