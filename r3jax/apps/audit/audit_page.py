@@ -113,8 +113,8 @@ def _cards(audit: Audit) -> dict[str, str]:
         cards["of the surface is seen well enough"] = fine
         cards["of surface that needs more views"] = sentences.area(audit, float(bad))
     else:
-        cards["of their pixels is seen well enough"] = fine
-        cards["of their pixels is not known"] = f"{100 * audit.shares[audit.unknown]:.0f} %"
+        cards["of their pixels are seen well enough"] = fine
+        cards["of their pixels are not known"] = f"{100 * audit.shares[audit.unknown]:.0f} %"
     where = "" if audit.source.is_complete else ", where it is known"
     cards[f"mean R of the frames{where}"] = f"{audit.mean_renderability:.2f}"
     if plan.views and audit.source.is_complete:

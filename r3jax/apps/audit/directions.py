@@ -123,7 +123,7 @@ def steps_between(
     if abs(elevation) < 80.0:
         parts.append(_face_words(turn) if is_straight else _turn_words(turn))
     way = "up" if elevation > 0 else "down"
-    tilt = f"{_rounded(elevation):.0f}° {way}"
+    tilt = f"{_rounded(elevation):.0f}° {way} from level"
     parts.append("hold it level" if abs(elevation) < 0.5 * _TURN else f"tilt it {tilt}")
     return parts
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
+from matplotlib.ticker import MaxNLocator
 
 from r3jax.apps.select.outputs import Written
 from r3jax.apps.select.select import Selected
@@ -31,7 +32,7 @@ _NUMBERED = 40
 """Maximum number of numbered frames, so that the numbers do not overlap."""
 
 _GROUPS = (("blurred", "Blurred"), ("twin", "Near-duplicates of a kept frame"),
-           ("adds", "Add little or nothing"), ("", "Left out"))  # fmt: skip
+           ("adds", "Not chosen, with what each would add"), ("", "Left out"))  # fmt: skip
 """Beginning of a reason, and the heading of its frames; the first match counts."""
 
 _SURFACES = {
@@ -84,8 +85,9 @@ def lead(found: Selected) -> list[str]:
     """Summarizes the selection in a sentence."""
     kept, total = len(found.choice.order), len(found.used)
     share = 100.0 * float(found.choice.share[-1])
+    verb = "reaches" if kept == 1 else "reach"
     sentence = (
-        f"{kept} of {total} frames ({100 * kept / total:.0f} %) reach {share:.0f} % of the mean "
+        f"{kept} of {total} frames ({100 * kept / total:.0f} %) {verb} {share:.0f} % of the mean "
         "renderability with all frames."
     )
     return [sentence]
@@ -153,6 +155,7 @@ def _curve(found: Selected) -> Figure:
         axes.plot([at], [value], "o", color=style.SECOND, markersize=8)
         axes.annotate(f"{at} frames: 99 %", (at, value), (8, -14), color=style.SECOND,
                       textcoords="offset points", fontsize=9, fontweight="bold")  # fmt: skip
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlim(0, None)
     axes.set_ylim(0, 1.12 * max(of_all, float(choice.renderability.max())))
     return figure
