@@ -41,8 +41,8 @@ from r3jax.geometry.cameras import Camera, pose_along
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.planning.candidates import spread
 from r3jax.planning.planner import decide, observe, start
+from r3jax.simulators.base import Simulator
 from r3jax.simulators.free_space import GroundTruth
-from r3jax.simulators.raycast.raycast import RaycastSimulator
 from r3jax.simulators.scenes.registry import open_scene
 from r3jax.splatting.views import Views, load_views
 
@@ -91,7 +91,7 @@ class Options:
 class Offer:
     """What a scene has on offer, and what judges."""
 
-    world: RaycastSimulator
+    world: Simulator
     truth: GroundTruth
     frames: tuple[Frame, ...]
     """The pool."""
@@ -191,7 +191,7 @@ def run(options: Options) -> list[dict[str, Any]]:
         for seed in options.seeds:
             for name, choose in choosers.items():
                 if (scene, name, seed) not in keys:
-                    record = {"scene": scene, "chooser": name, "seed": seed}
+                    record: dict[str, Any] = {"scene": scene, "chooser": name, "seed": seed}
                     record |= judged(tuple(choose(seed)), given(), seed, options)
                     append_line(path, json.dumps(record))
                     print(f"{scene}, {name}, seed {seed}: {np.mean(record['psnr']):.2f} dB",
