@@ -335,12 +335,13 @@ class Source:
         )
 
 
-def source_of(capture: Run | PosedImages, name: str) -> Source:
+def source_of(capture: Run | PosedImages, name: str, *, has_model: bool = False) -> Source:
     """Creates a source for an audit from any capture.
 
     Args:
         capture: the opened capture; for a recording, with unchanged poses (`up="z"`).
         name: name of the capture in reports.
+        has_model: True if depth will come from a trained splat: photos alone are enough then.
 
     Raises:
         FormatError: no images, neither depth nor points, a damaged cloud, or a lens that cannot
@@ -349,7 +350,7 @@ def source_of(capture: Run | PosedImages, name: str) -> Source:
     if not len(capture.rows if isinstance(capture, Run) else capture):
         raise FormatError(capture.path, "there are no views to audit")
     if isinstance(capture, PosedImages):
-        return _of_images(capture, name)
+        return _of_images(capture, name, has_model)
     poses = np.stack([row.pose for row in capture.rows]).astype(np.float64)
     labels = tuple(f"view {row.step + 1}" for row in capture.rows)
     up = np.array([0.0, 0.0, 1.0])
@@ -365,7 +366,7 @@ def source_of(capture: Run | PosedImages, name: str) -> Source:
     return Source(name, poses, (lens,) * len(poses), labels, "depth", True, up, stride, read)
 
 
-def _of_images(images: PosedImages, name: str) -> Source:
+def _of_images(images: PosedImages, name: str, has_model: bool) -> Source:
     if len(images) > 2 and np.ptp(images.poses, axis=0).max() == 0.0:
         raise FormatError(
             images.path,
@@ -399,6 +400,12 @@ def _of_images(images: PosedImages, name: str) -> Source:
             is_camera, images.up, stride,
             lambda index: _read_dense(images, index, stride, has_images), has_images, remark,
             photograph, images.reconstruction, images.photo_of,
+        )  # fmt: skip
+    if has_model and has_images and not images.points and images.points_path is None:
+        return Source(
+            name, images.poses, images.lenses, labels, "model", False, images.up, stride,
+            lambda index: _read_colors(images, index, stride), has_images, remark, photograph,
+            images.reconstruction, images.photo_of,
         )  # fmt: skip
     if images.points is not None and len(images.points.seen_point):
         kind: Kind = "tracks"
@@ -502,6 +509,11 @@ def _read_dense(images: PosedImages, index: int, stride: int, has_images: bool) 
     return colors, np.where(is_there, table.take(depth), np.float32(0.0))
 
 
+def _read_colors(images: PosedImages, index: int, stride: int) -> Picture:
+    colors, _ = _thinned_colors(images, index, stride)
+    return colors, np.zeros(colors.shape[:2], np.float32)
+
+
 def _thinned_colors(images: PosedImages, index: int, stride: int) -> tuple[np.ndarray, np.ndarray]:
     """Reads colors [h, w, 3] uint8 of a thinned image, and the mask of its pixels, [h, w]."""
     table = sampling_table(images.lenses[index], stride)
@@ -555,10 +567,12 @@ def _cloud(images: PosedImages) -> tuple[np.ndarray, np.ndarray]:
         is_file = images.path.suffix == ".json"
         model = find_model(images.path.parent) if is_file else None
         beside = "" if model is None else f"; the COLMAP model beside it has points: audit {model}"
+        absent = "" if images.has_images else f", and {images.image_paths[0]} is missing, too"
         raise FormatError(
             images.path,
             "there are neither depth images nor points: an audit needs one of them (COLMAP's "
-            f"points3D, nerfstudio's ply_file_path or depth_file_path){beside}",
+            "points3D, nerfstudio's ply_file_path or depth_file_path) or a splat trained on "
+            f"the photos (--model){absent}{beside}",
         )
     if len(xyz) > _MAX_POINTS:
         chosen = np.random.default_rng(0).choice(len(xyz), _MAX_POINTS, replace=False)

@@ -1,6 +1,7 @@
 """Which surfaces a capture without depth gets."""
 
 import dataclasses
+import json
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +12,7 @@ from r3jax.captures.source import source_of
 from r3jax.captures.surfaces import with_surfaces
 from r3jax.errors import InputError
 from r3jax.formats.captures import open_capture
+from r3jax.formats.errors import FormatError
 from r3jax.kernels.constants import SH0
 from r3jax.splatting.ply import write_scene
 from r3jax.splatting.scene import GaussianScene
@@ -21,6 +23,7 @@ from tests.apps.audit.room import (
     round_poses,
     wall_points,
     write_colmap,
+    write_nerfstudio,
 )
 
 
@@ -92,3 +95,20 @@ def test_a_splat_of_another_place_or_scale_is_refused_with_the_difference(
 ):
     with pytest.raises(InputError, match=said):
         with_surfaces(room, model=wall_splat(tmp_path / "scene.ply", **wrong))
+
+
+def test_a_splat_is_enough_for_photos_without_depth_and_points(tmp_path):
+    folder = write_nerfstudio(tmp_path / "room", round_poses(12), depth=False)
+    content = json.loads((folder / "transforms.json").read_text())
+    del content["ply_file_path"]
+    (folder / "transforms.json").write_text(json.dumps(content))
+    capture = open_capture(folder)
+    with pytest.raises(FormatError, match="--model"):
+        source_of(capture.source, "room")
+    source = source_of(capture.source, "room", has_model=True)
+    found = with_surfaces(source, model=wall_splat(tmp_path / "scene.ply"))
+    known = np.mean([(found.read(index)[1] > 0.0).mean() for index in range(12)])
+    assert found.kind == "model"
+    assert known > 0.3
+    with pytest.raises(InputError, match="covers 0 %"):
+        with_surfaces(source, model=wall_splat(tmp_path / "scene.ply", shift=100.0))

@@ -199,6 +199,12 @@ def test_more_frames_than_there_are_keep_all_and_it_is_said(captures, tmp_path):
     assert any("60" in note and "16" in note for note in record["notes"])
 
 
+def test_frames_that_were_not_looked_at_are_counted(captures, tmp_path):
+    out = tmp_path / "out"
+    assert select(captures / "recording", out, "--frames", "3", "--max-frames", "8") == 0
+    assert any("8 of the capture's 16 frames" in note for note in record_of(out)["notes"])
+
+
 def test_frames_that_must_stay_stay(captures, tmp_path):
     names = open_capture(captures / "recording", "z").source.image_paths
     words = ("--frames", "3", "--keep", names[5].name, names[6].stem)

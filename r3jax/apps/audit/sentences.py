@@ -312,7 +312,7 @@ def saturation() -> str:
         f"With a mean of {SATURATED:g} or more, the pictures cover each other well, and R cannot "
         "predict which of them renders better: for 250 pictures of a kitchen with a mean of 0.96, "
         "each held out once, the rank correlation of R and PSNR was 0.00. These pictures are "
-        "therefore not ranked; only better pictures, not more of them, would improve the result."
+        "therefore not ranked."
     )
 
 

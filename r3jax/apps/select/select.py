@@ -334,6 +334,12 @@ def _notes(found: Selected, targets: Targets, num_unread: int) -> tuple[str, ...
         )
     if num_unread:
         notes.append(f"{num_unread} frames cannot be read and are left out.")
+    looked = len(used) + num_unread + len(found.survey.strays)
+    if looked < len(found.source):
+        notes.append(
+            f"{looked} of the capture's {len(found.source)} frames were looked at, evenly spaced: "
+            f"--max-frames {len(found.source)} looks at all of them."
+        )
     sizes = np.bincount(found.scenes)
     large = np.flatnonzero(sizes >= max(2, _SEVERAL * len(used)))
     if len(large) > 1:

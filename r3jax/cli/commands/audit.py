@@ -56,7 +56,9 @@ def run_audit(options: AuditOptions) -> int:
             options.capture, "z", parse_topics(options.topics), options.terms.cut
         )
         path = None if options.path is None else path_of(options.path, capture.source)
-        _audit(options, source_of(capture.source, capture.name), path, progress)
+        has_model = options.terms.model is not None
+        source = source_of(capture.source, capture.name, has_model=has_model)
+        _audit(options, source, path, progress)
     return 0
 
 
@@ -137,7 +139,7 @@ def _check_folder(folder: Path, capture: Path) -> None:
 
 
 def _show(console: Console, found: Audit, written: dict[str, Path]) -> None:
-    for sentence in sentences.verdict(found):
+    for sentence in (sentences.headline(found), *sentences.verdict(found)):
         console.print(sentence)
     if found.regions:
         console.print(_regions(found))
