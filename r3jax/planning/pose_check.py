@@ -123,11 +123,6 @@ def check_poses(reference: Reference | None, frame: Frame) -> Reference:
     ):
         # Upside down, or rolled: that these two frames fit may be chance.
         return replace(now, suspect=reference.suspect, num_suspected=reference.num_suspected)
-    if not _is_upright(now.T_world_camera, "opencv") and any(
-        _is_upright(now.T_world_camera, name) for name in shares
-    ):
-        # Upside down, or rolled: that these two frames fit may be chance.
-        return replace(now, suspect=reference.suspect, num_suspected=reference.num_suspected)
     # Finished once every other convention would have been detected in the same pair.
     if all(not share <= _MAX_CONTRADICTED for share in shares.values()):
         return replace(reference, is_settled=True)

@@ -10,11 +10,9 @@ On the host: NumPy. Shape symbols: n pieces of a path, the last one ends at the 
 directions; B bins of a panorama.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -200,8 +198,7 @@ def count_look(
     if not isinstance(policy_state, PlannerState):
         return policy_state
     visible = visible_unexplored(map_state, grid, camera, T_world_camera, scoring)
-    looks = policy_state.looks + visible.astype(jnp.int32)
-    return eqx.tree_at(lambda s: s.looks, policy_state, looks)
+    return replace(policy_state, looks=policy_state.looks + np.asarray(visible, dtype=np.int32))
 
 
 def panorama_scores(

@@ -31,6 +31,7 @@ from r3jax.planning.far import (
 from r3jax.planning.far_paths import Coarse, coarse_arrays
 from r3jax.planning.planner import at_hand, decide_ahead, first_map, reconsider
 from r3jax.planning.policy import Decision
+from r3jax.planning.turning import count_look
 from tests.mapping.test_tiles import assert_same_map
 from tests.rooms_of_boxes import frame_in_room, pose_at
 
@@ -335,6 +336,12 @@ def test_nothing_is_compiled_when_the_block_moves_and_leaves_views_behind():
     planner, here = in_a_corridor(policy)
     far = replace(planner.far, coarse=Coarse(planner.far.tiles.lattice))
     _, planner, _ = r3jax.decide(replace(planner, far=far), here, KEY)
+    # As frames that were captured on the way are counted.
+    pose = jnp.asarray(here, dtype=jnp.float32)
+    looked = count_look(
+        planner.policy_state, planner.map_state, planner.grid, CAMERA, pose, scoring
+    )
+    planner = replace(planner, policy_state=looked)
     left = a_view([0.1, 0.6, 0.6], here[:3, 3], 1.0, 5.0)
     before = compilations.count
     away = at_hand(
