@@ -42,7 +42,8 @@ class GrowthAhead:
             return
         self._prepared = 2 * capacity
         task = (planner, frame, 2 * capacity)
-        self._thread = threading.Thread(target=_compile, args=task, name="growth", daemon=True)
+        # No daemon: a process that ends while XLA compiles in one is aborted.
+        self._thread = threading.Thread(target=_compile, args=task, name="growth")
         self._thread.start()
 
     def wait(self) -> None:

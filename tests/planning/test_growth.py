@@ -1,5 +1,8 @@
 """The next size of a map is ready before the map is full, and what is ready changes nothing."""
 
+import subprocess
+import sys
+
 import jax
 import numpy as np
 import pytest
@@ -49,3 +52,17 @@ def test_nothing_is_prepared_where_there_is_room_or_no_growth(monkeypatch):
     monkeypatch.setattr(growth, "_compile", lambda *args: prepared.append(args))
     mapped(1 << 18, growth.GrowthAhead())
     assert prepared == []
+
+
+def test_a_process_that_ends_waits_for_what_is_being_prepared():
+    """XLA aborts a process that ends while it compiles."""
+    program = """
+import time
+from types import SimpleNamespace as Any
+from r3jax.planning import growth
+growth._compile = lambda *args: (time.sleep(0.5), print("prepared"))
+state, config = Any(capacity=64, num_occupied=32), Any(allow_growth=True)
+growth.GrowthAhead().look(Any(map_state=state, far=None, config=config), None)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "prepared\n"), done.stderr
