@@ -227,12 +227,13 @@ def test_a_thin_thing_that_the_map_does_not_hold_is_an_obstacle(height):
     assert not np.isfinite(room.cost[18:]).any()
 
 
-def test_a_low_camera_that_looks_down_trusts_the_floor_near_its_views_only():
-    """From afar its image ends below a shelf, and shows the floor below it."""
+@pytest.mark.parametrize("height", [0.3, 0.9, 1.2])
+def test_a_camera_that_looks_down_trusts_the_floor_near_its_views_only(height):
+    """From afar its image ends below a shelf or a desk, and shows the floor below it."""
     free = all_free()
     free[:, :, :2] = False  # nothing is known of the lowest layer, but for the floor's voxels
     camera = Camera(64, 48, 60.0, 60.0, 32.0, 24.0)  # 22 degrees up and down
-    down = pose_at(1.0, 2.0, 0.3)
+    down = pose_at(1.0, 2.0, height)
     angle = np.radians(30.0)
     level = down[:3, :3].copy()
     down[:3, 2] = np.cos(angle) * level[:, 2] - np.sin(angle) * np.array([0.0, 0.0, 1.0])
@@ -240,9 +241,9 @@ def test_a_low_camera_that_looks_down_trusts_the_floor_near_its_views_only():
     opened = lambda pose, views=None: room_for(
         Body(0.1), grid_of(free), floor_voxels(), VOXEL, pose, camera, Been(views=views)
     ).fits(np.array([[1.4, 2.0], [2.4, 2.0], [3.4, 2.0]]))
-    np.testing.assert_array_equal(opened(pose_at(1.0, 2.0, 0.3)), [True, True, True])
+    np.testing.assert_array_equal(opened(pose_at(1.0, 2.0, height)), [True, True, True])
     np.testing.assert_array_equal(opened(down), [True, False, False])
-    toward = np.array([[1.0, 2.0, 0.3, 1.0, 0.0, 0.0], [2.0, 2.0, 0.3, 1.0, 0.0, 0.0]])
+    toward = np.array([[x, 2.0, height, 1.0, 0.0, 0.0] for x in (1.0, 2.0)])
     away = toward * [[1.0] * 6, [1.0, 1.0, 1.0, -1.0, 1.0, 1.0]]
     np.testing.assert_array_equal(opened(down, toward), [True, True, False])
     np.testing.assert_array_equal(opened(down, away), [True, False, False])

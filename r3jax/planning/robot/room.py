@@ -441,16 +441,17 @@ class _Known:
         return _closed(seen, least) | (_closed(seen, least + 1.0) & is_clear)
 
     def reach_above_floor(self, camera: Camera | None, T_world_camera: np.ndarray) -> float:
-        """Computes up to where the image shows what stands on the floor it shows [m].
+        """Computes up to where the image shows all that the body would run into [m].
 
-        A low camera that looks down shows the floor far off, and nothing above it: the floor below
-        a shelf, and not the shelf.
+        A camera that looks down shows the floor far off, and little above it: the floor below a
+        desk, and not its edge.
         """
         slope = _upper_slope(camera, T_world_camera)
         if slope >= 0.0:
             return math.inf
-        needed = _highest_seen(camera, T_world_camera, self.height, self.body)
-        return (self.height - min(needed, self.low + 0.5 * self.size)) / -slope
+        top = float((self.top - self.floor).max())
+        needed = min(top, _highest_seen(camera, T_world_camera, self.height, self.body))
+        return (self.height - max(needed, self.low)) / -slope
 
     def shown_within(self, camera: Camera, views: np.ndarray, reach: float) -> np.ndarray:
         """Finds pixels that a view had ahead of it within a distance, [x, y] bool.
