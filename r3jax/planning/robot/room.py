@@ -692,7 +692,11 @@ def _highest_seen(
 ) -> float:
     """Computes how high above the floor the image shows what the robot is about to reach [m]."""
     slope = _upper_slope(camera, T_world_camera)
-    return math.inf if slope >= 0.0 else height + slope * (body.needed + _AHEAD)
+    if slope >= 0.0:
+        return math.inf
+    # A camera whose image begins farther off shows the next step of the robot from there only.
+    ahead = max(_AHEAD, _blind_radius(camera, T_world_camera, height))
+    return height + slope * (body.needed + ahead)
 
 
 def _upper_slope(camera: Camera | None, T_world_camera: np.ndarray) -> float:
