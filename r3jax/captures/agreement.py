@@ -10,7 +10,7 @@ the unknown scale of monocular reconstruction.)
 Shape symbols: n points; h, w size of an image.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -29,6 +29,13 @@ _POINTS, _PICTURES, _SIDE = 100, 24, 160
 
 _FEWEST_POINTS = 400
 """Minimum number of comparisons; with fewer, the images hardly overlap."""
+
+_SHARED = 0.1
+"""Minimum share of points that other images see or see through, or the images show separate rooms:
+all points are behind the walls of others."""
+
+_RARELY = 0.05
+"""Fewer points that other images see through than this, for each that they see, and all is right."""
 
 _SEE_THROUGH_RATIO = 0.8
 """Points that other images see through, for each that they see: 0.01 to 0.03 in good captures, 0.4
@@ -121,8 +128,18 @@ class _Agreement(NamedTuple):
     """Share of them that the other image sees through."""
 
     @property
+    def is_clear(self) -> bool:
+        """True if nothing contradicts, however much the images hide from each other."""
+        return self.there >= _SHARED and self.through <= _RARELY * self.there
+
+    @property
     def score(self) -> float:
-        """Evidence for agreement less evidence against it, at most 1; hidden points are neutral."""
+        """Evidence for agreement less evidence against it, above 1 where it is clear.
+
+        Hidden points are neutral: where it is clear, the evidence against it counts per point seen.
+        """
+        if self.is_clear:
+            return 2.0 + 0.1 * self.there - self.through / self.there
         return self.there - self.through
 
 
@@ -263,10 +280,17 @@ MISTAKES = (
 """The mistakes, in the order in which they are tried."""
 
 
-def check_agreement(images: Sequence[DepthImage]) -> None:
+def check_agreement(
+    images: Sequence[DepthImage], neighbors: Iterable[Sequence[DepthImage]] = ()
+) -> None:
     """Refuses depth images that contradict the poses, or each other.
 
     Images that do not overlap, or were taken from one place, are accepted: no depth is wrong there.
+
+    Args:
+        images: from all over the capture.
+        neighbors: images of cameras near each other, for several places; where those from all over
+            a building do not overlap, the best of these places is judged.
 
     Raises:
         ValueError: a common mistake explains them far better; or other images see through nearly as
@@ -274,6 +298,14 @@ def check_agreement(images: Sequence[DepthImage]) -> None:
     """
     pictures = _coarser(images)
     found = _compared(pictures)
+    if found.there + found.through < _SHARED:
+        places = [_coarser(near) for near in neighbors]
+        found, pictures = max(
+            [(found, pictures), *((_compared(place), place) for place in places)],
+            key=lambda one: one[0].score,
+        )
+    if found.is_clear:
+        return
     explained = _explained(pictures, found)
     if explained is not None:
         mistake, size, better = explained

@@ -14,7 +14,7 @@ object from far away. A second room has more cameras, and is kept.
 Shape symbols: n poses; k depths or points.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -219,7 +219,7 @@ def survey_of(source: Source, settings: SurveySettings) -> Survey:
     doubt = None
     if source.is_dense:
         try:
-            _check_depth(images, median)
+            _check_depth(images, median, _neighbors(source, chosen))
         except ValueError as error:
             if not settings.trust_depth:
                 raise
@@ -294,7 +294,19 @@ def _measured(source: Source, images: list[DepthImage]) -> tuple[np.ndarray, np.
     return depths, np.concatenate(world)
 
 
-def _check_depth(images: list[DepthImage], median: float) -> None:
+def _neighbors(source: Source, chosen: np.ndarray) -> Iterator[list[DepthImage]]:
+    """Reads images of cameras near each other, at three places of a capture that has more."""
+    if len(source) <= _SURVEYED:
+        return
+    eyes = source.poses[:, :3, 3]
+    for middle in chosen[evenly_spaced(len(chosen), 5)[1:-1]]:
+        near = np.argsort(np.linalg.norm(eyes - eyes[middle], axis=1))[: 2 * _COMPARED]
+        yield _depth_images(source, np.sort(near))
+
+
+def _check_depth(
+    images: list[DepthImage], median: float, neighbors: Iterator[list[DepthImage]]
+) -> None:
     """Refuses depth that is implausible for an indoor camera, or contradicts the poses."""
     if not _NEAREST < median < FAR:
         factor = 10.0 ** round(np.log10(_TYPICAL / median))
@@ -303,7 +315,7 @@ def _check_depth(images: list[DepthImage], median: float) -> None:
             f"multiplies by {factor:g} (in a transforms.json: depth_unit_scale_factor); "
             "--trust-depth audits it as it is"
         )
-    check_agreement(images)
+    check_agreement(images, neighbors)
 
 
 def _range(far: float, is_metric: bool, wanted: float | None) -> float:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from r3jax.captures.agreement import DepthImage, check_agreement
 from r3jax.captures.settings import SurveySettings
-from r3jax.captures.source import ray_lengths, source_of
+from r3jax.captures.source import Source, ray_lengths, source_of
 from r3jax.captures.survey import on_lattice, survey_of
 from r3jax.formats.recordings import read_recording
 from r3jax.geometry.cameras import Camera
@@ -53,8 +53,11 @@ def looks(factor: float = 1.0, turn: np.ndarray | None = None) -> list[DepthImag
 def test_a_wrong_unit_of_depth_is_refused_and_the_right_one_named(factor):
     with pytest.raises(ValueError, match="multiplied by") as refusal:
         check_agreement(looks(factor))
-    named = float(str(refusal.value).partition("multiplied by ")[2].partition(":")[0])
-    assert named == pytest.approx(1.0 / factor, rel=0.15)
+    assert named_factor(refusal) == pytest.approx(1.0 / factor, rel=0.15)
+
+
+def named_factor(refusal: pytest.ExceptionInfo[ValueError]) -> float:
+    return float(str(refusal.value).partition("multiplied by ")[2].partition(":")[0])
 
 
 def with_lens(fx: float = 1.0, fy: float = 1.0, dx: float = 0.0, dy: float = 0.0):
@@ -128,6 +131,26 @@ def test_where_nothing_can_be_compared_nothing_is_said():
     check_agreement([DepthImage(5.0 * picture(pose)[1], LENS.camera, pose) for pose in turned])
     check_agreement(looks(5.0)[:1])
     check_agreement([DepthImage(0.0 * look.depth, look.camera, look.pose) for look in looks()])
+
+
+def building(factor: float, across: int = 10) -> Source:
+    """Rooms turned at random, side by side: no camera can see what one in another room shows."""
+    rooms = np.tile(np.eye(4), (across**2, 1, 1))
+    rooms[:, :3, :3] = Rotation.random(across**2, random_state=0).as_matrix()
+    rooms[:, :2, 3] = 20.0 * np.indices((across, across)).reshape(2, -1).T
+    poses = (rooms[:, None] @ np.stack([pose for _, pose in SHOWN])).reshape(-1, 4, 4)
+    color = np.zeros((*SHOWN[0][0].shape, 3), np.uint8)
+    return Source("b", poses, (LENS,) * len(poses), tuple(map(str, range(len(poses)))), "depth",
+                  True, np.array([0.0, 0.0, 1.0]), 1,
+                  lambda index: (color, factor * SHOWN[index % len(SHOWN)][0]))  # fmt: skip
+
+
+def test_in_a_building_images_are_compared_with_those_of_the_same_room():
+    survey_of(building(1.0), SurveySettings())
+    for factor in (0.5, 2.0):
+        with pytest.raises(ValueError, match="multiplied by") as refusal:
+            survey_of(building(factor), SurveySettings())
+        assert named_factor(refusal) == pytest.approx(1.0 / factor, rel=0.15)
 
 
 def test_a_real_recording_fits_and_five_times_its_depth_does_not():
