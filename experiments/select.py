@@ -64,7 +64,7 @@ Record = dict[str, Any]
 class Options:
     """Compares choices of frames by what is trained on them."""
 
-    captures: tuple[Path, ...]
+    captures: tuple[Path, ...] = ()
     """What `r3jax select` reads."""
 
     shares: tuple[float, ...] = (0.2, 0.1, 0.05, 0.4)
@@ -378,6 +378,17 @@ def compared(
     return [r for r in at if r["capture"] in captures], captures
 
 
+def comparable(records: Sequence[Record], share: float) -> list[list[str]]:
+    """Groups choosers by the captures on which all of a group are done, most captures first."""
+    done: dict[str, set[str]] = {}
+    for record in records:
+        if record["share"] in (share, 1.0):
+            done.setdefault(record["chooser"], set()).add(record["capture"])
+    sets = {frozenset(captures) for chooser, captures in done.items() if chooser != "all"}
+    by_size = sorted(sets, key=lambda captures: (-len(captures), sorted(captures)))
+    return [[c for c in done if done[c] >= captures] for captures in by_size]
+
+
 def table(at: Sequence[Record]) -> list[dict[str, Any]]:
     """One row per chooser, the best first: means over the captures, with intervals."""
     rows: list[tuple[float, dict[str, Any]]] = []
@@ -455,12 +466,13 @@ def by_capture(
         for capture in captures:
             found = [np.mean(r[metric]) for r in own if r["capture"] == capture and r.get(metric)]
             row[capture] = f"{np.mean(found):.2f}" if found else "–"
-        rows.append(row)
+        if own:
+            rows.append(row)
     return rows
 
 
-def write_page(records: Sequence[Record], choosers: Sequence[str], folder: Path) -> None:
-    """Writes the tables, one of each share and number of iterations."""
+def write_page(records: Sequence[Record], folder: Path) -> None:
+    """Writes the tables of each share and number of iterations."""
     lines: list[str] = []
     for terms in dict.fromkeys((r["iterations"], r["resolution"]) for r in records):
         some = [r for r in records if (r["iterations"], r["resolution"]) == terms]
@@ -468,8 +480,8 @@ def write_page(records: Sequence[Record], choosers: Sequence[str], folder: Path)
             lines.append(
                 f"## {100 * share:g} % of the frames, {terms[0]} iterations at {terms[1]} px"
             )
-            at, captures = compared(some, share, choosers)
-            if captures:
+            for choosers in comparable(some, share):
+                at, captures = compared(some, share, choosers)
                 lines += [f"Means over {', '.join(captures)}:", markdown_table(table(at))]
             lines += ["Colors corrected, by capture:", markdown_table(by_capture(some, share))]
             lines += ["Plain PSNR:", markdown_table(by_capture(some, share, "psnr"))]
@@ -486,7 +498,7 @@ def main(options: Options) -> None:
     path = options.out / "records.jsonl"
     if not options.only_table:
         run(options, path)
-    write_page(list(read_records(path).values()), options.choosers, options.out)
+    write_page(list(read_records(path).values()), options.out)
 
 
 if __name__ == "__main__":

@@ -11,27 +11,32 @@ from experiments.select import compared, difference, read_records
 from r3jax.plots import style
 
 FOLDER = Path("experiments/results/select")
-CHOOSERS = ("select", "uniform", "farthest", "sharp-frames", "random", "all")
-"""Those that every capture has."""
+CHOOSERS = ("select", "uniform", "farthest", "sharp-frames", "all")
+"""Those that every panel has."""
+
+HELD_OUT = ("walk-kitchen", "walk-loft", "walk-library", "walk-villa")
+"""Captures that no rule was corrected on."""
 
 
 def main() -> None:
-    """Draws PSNR minus that of all frames, with intervals, one panel for each share."""
+    """Draws PSNR minus that of all frames, with intervals, one panel for each share and length."""
     records = list(read_records(FOLDER / "records.jsonl").values())
-    shares = sorted({r["share"] for r in records} - {1.0})
-    panels = [(share, *compared(records, share, CHOOSERS)) for share in shares]
-    figure = style.new_figure(10.0, 3.0)
-    axes = figure.subplots(1, len(panels), sharex=True, squeeze=False)[0]
-    for part, (share, at, captures) in zip(axes, panels, strict=True):
-        found = [(difference(at, name, "all"), name) for name in CHOOSERS[:-1]]
-        rows = sorted(((d, n) for d, n in found if d is not None), key=lambda row: row[0].value)
-        title = f"{100 * share:g} % of the frames, {len(captures)} captures"
-        style.dress(part, title, "PSNR minus that of all frames [dB]")
-        for height, (loss, name) in enumerate(rows):
+    own = [r for r in records if r["capture"] in HELD_OUT]
+    terms = sorted({(r["iterations"], r["share"]) for r in own if r["share"] < 1.0})
+    figure = style.new_figure(12.0, 2.6)
+    axes = figure.subplots(1, len(terms), sharex=True, sharey=True, squeeze=False)[0]
+    for part, (iterations, share) in zip(axes, terms, strict=True):
+        some = [r for r in own if r["iterations"] == iterations]
+        at, _ = compared(some, share, CHOOSERS)
+        title = f"{100 * share:g} %, {iterations:,} iterations"
+        style.dress(part, title, "PSNR minus all frames [dB]")
+        for height, name in enumerate(reversed(CHOOSERS[:-1])):
+            loss = difference(at, name, "all")
+            assert loss is not None, (name, share, iterations)
             color = style.ACCENT if name == "select" else style.MUTED
             part.plot([loss.low, loss.high], [height, height], color=color, linewidth=2)
             part.plot([loss.value], [height], "o", color=color, markersize=7)
-        part.set_yticks(range(len(rows)), [name for _, name in rows])
+        part.set_yticks(range(len(CHOOSERS) - 1), reversed(CHOOSERS[:-1]))
         part.axvline(0.0, color=style.MUTED, linewidth=1, linestyle="--")
     origin = joint_origin(
         "docs.figures.select", [r["machine"] for r in records], [r["commit"] for r in records]

@@ -11,6 +11,7 @@ from experiments.select import (
     Cell,
     Options,
     by_capture,
+    comparable,
     compared,
     exposed_psnr,
     main,
@@ -79,6 +80,10 @@ def test_leads_pair_the_same_captures_and_seeds():
     assert rows["uniform"]["select minus it"].startswith("+0.50 ")
     assert rows["select"]["trainings"] == 3
     assert by_capture(records, 0.1)[0] == {"chooser": "select", "a": "22.00", "b": "60.00"}
+    records.append(record("b", "random", 0, [10.0, 10.0]))
+    assert comparable(records, 0.1) == [["select", "uniform"], ["select", "uniform", "random"]]
+    assert compared(records, 0.1, comparable(records, 0.1)[1])[1] == ["b"]
+    assert [row["chooser"] for row in by_capture(records, 0.2)] == []
 
 
 def test_a_gain_of_each_channel_does_not_count_where_exposures_differ():
