@@ -35,7 +35,7 @@ _SHARED = 0.1
 all points are behind the walls of others."""
 
 _RARELY = 0.05
-"""Fewer points that other images see through than this, for each that they see, and all is right."""
+"""With fewer points that others see through than this, for each that they see, all is right."""
 
 _SEE_THROUGH_RATIO = 0.8
 """Points that other images see through, for each that they see: 0.01 to 0.03 in good captures, 0.4

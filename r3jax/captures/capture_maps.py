@@ -13,8 +13,10 @@ folds. No result depends on the order of the images.
 Shape symbols: N rows; F folds.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -22,8 +24,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from r3jax.captures.settings import SurveySettings
 from r3jax.captures.source import Source
-from r3jax.captures.survey import MARGIN, RANGE, Survey
+from r3jax.captures.survey import LARGEST_VOXEL, MARGIN, RANGE, Survey
 from r3jax.errors import InputError
 from r3jax.frame import Frame
 from r3jax.kernels import calls
@@ -54,6 +57,50 @@ class TooManyVoxelsError(InputError):
 
 OnFrame = Callable[[], None]
 """Callback after each image; each image is processed twice."""
+
+_COARSER = 1.5
+"""Least factor of the voxel size for a place of too many voxels: 2.25 times fewer hold its
+surfaces."""
+
+Mapped = TypeVar("Mapped")
+
+
+def in_fitting_voxels(
+    survey: Survey,
+    settings: SurveySettings,
+    make: Callable[[Survey, OnFrame], Mapped],
+    on_frame: OnFrame = lambda: None,
+) -> tuple[Survey, Mapped]:
+    """Makes a map, in larger voxels where the user leaves that open and the place is large.
+
+    The next size is that in which all images would fit if the others show as much as those so far.
+
+    Args:
+        survey: the images to use and the resolution.
+        settings: what the user asked for.
+        make: makes the map from all images; called again after an overflow.
+        on_frame: progress callback.
+
+    Raises:
+        TooManyVoxelsError: the user's voxels are too small, or the largest are.
+    """
+    done = 0
+
+    def counted() -> None:
+        nonlocal done
+        done += 1
+        on_frame()
+
+    while True:
+        done = 0
+        try:
+            return survey, make(survey, counted)
+        except TooManyVoxelsError:
+            size = survey.voxel_size
+            if settings.voxel_size is not None or _COARSER * size > LARGEST_VOXEL:
+                raise
+            factor = max(_COARSER, math.sqrt(len(survey.chosen) / (done + 1)))
+            survey = survey.with_voxels(min(factor * size, LARGEST_VOXEL))
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 import functools
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import equinox as eqx
@@ -146,6 +147,34 @@ def test_voxels_that_are_far_too_small_are_refused(monkeypatch):
     monkeypatch.setattr(real, "_CAPACITY", 1 << 10)
     with pytest.raises(ValueError, match="larger --voxel-size"):
         see(source, survey, folds=2)
+
+
+def test_a_place_of_too_many_voxels_is_mapped_in_larger_ones_unless_they_are_given(monkeypatch):
+    source, survey = room()
+    needed = int(see(source, survey, folds=2).state.num_occupied)
+    monkeypatch.setattr(real, "_MOST_ROWS", 1 << (needed.bit_length() - 2))
+    monkeypatch.setattr(real, "_CAPACITY", 1 << 5)
+    tried: list[tuple[float, int]] = []
+
+    def mapped(survey: Survey, on_frame: Callable[[], None]) -> Seen:
+        tried.append((survey.voxel_size, 0))
+
+        def counted() -> None:
+            tried[-1] = tried[-1][0], tried[-1][1] + 1
+            on_frame()
+
+        return see(source, survey, 2, counted)
+
+    fitting, found = real.in_fitting_voxels(survey, SurveySettings(), mapped)
+    sizes, seen_images = zip(*tried, strict=True)
+    assert float(found.state.voxel_size) == pytest.approx(fitting.voxel_size)
+    assert fitting.voxel_size > survey.voxel_size
+    assert int(found.state.num_occupied) <= real._MOST_ROWS
+    assert seen_images[-1] == 2 * NUM
+    for size, larger, images in zip(sizes, sizes[1:], seen_images, strict=False):
+        assert larger == pytest.approx(size * max(1.5, (NUM / (images + 1)) ** 0.5))
+    with pytest.raises(ValueError, match="larger --voxel-size"):
+        real.in_fitting_voxels(survey, SurveySettings(voxel_size=survey.voxel_size), mapped)
 
 
 def test_more_folds_than_pictures_leave_one_each():

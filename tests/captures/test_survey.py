@@ -136,7 +136,8 @@ def test_where_nothing_can_be_compared_nothing_is_said():
 def building(factor: float, across: int = 10) -> Source:
     """Rooms turned at random, side by side: no camera can see what one in another room shows."""
     rooms = np.tile(np.eye(4), (across**2, 1, 1))
-    rooms[:, :3, :3] = Rotation.random(across**2, random_state=0).as_matrix()
+    turns = np.random.default_rng(0).normal(0.0, 2.0, (across**2, 3))
+    rooms[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix()
     rooms[:, :2, 3] = 20.0 * np.indices((across, across)).reshape(2, -1).T
     poses = (rooms[:, None] @ np.stack([pose for _, pose in SHOWN])).reshape(-1, 4, 4)
     color = np.zeros((*SHOWN[0][0].shape, 3), np.uint8)

@@ -30,12 +30,12 @@ from r3jax.apps.audit.diagnosis import (
 from r3jax.apps.audit.settings import AuditSettings
 from r3jax.apps.audit.suggest import SuggestedViews, Task, suggest
 from r3jax.captures.camera_paths import CameraPath
-from r3jax.captures.capture_maps import Seen, TooManyVoxelsError, see
+from r3jax.captures.capture_maps import OnFrame, Seen, in_fitting_voxels, see
 from r3jax.captures.faults.faults import Faults, find_faults, stray_finding
 from r3jax.captures.source import Source, thinned
 from r3jax.captures.standpoints import Places, inward_center, places_of
 from r3jax.captures.surfaces import with_surfaces
-from r3jax.captures.survey import LARGEST_VOXEL, RANGE, Survey, survey_of
+from r3jax.captures.survey import RANGE, Survey, survey_of
 from r3jax.errors import InputError
 from r3jax.formats.lenses import Lens
 from r3jax.geometry.cameras import Camera
@@ -199,7 +199,12 @@ def audit(
     settings = AuditSettings() if settings is None else settings
     step = lambda: on_progress("", 1)
     source, survey, faults = _survey(source, settings, step, on_progress)
-    survey, seen = _mapped(source, survey, settings, step, on_progress)
+
+    def mapped(survey: Survey, on_frame: OnFrame) -> Seen:
+        on_progress("mapping", 2 * len(survey.chosen))
+        return see(source, survey, settings.folds, on_frame)
+
+    survey, seen = in_fitting_voxels(survey, settings, mapped, step)
     unit = _UNSEEN_WEIGHT * (survey.cell_size / survey.voxel_size) ** 2
     config = ScoringConfig(lambda1=unit, max_range=RANGE)
     lens = Counter(source.lenses).most_common(1)[0][0]
@@ -280,28 +285,6 @@ def _survey(
             "of known depth: an audit judges each picture by the others, so it needs at least two"
         )
     return source, survey, faults
-
-
-_COARSER = 1.5
-"""Factor of the voxel size for a place of too many voxels: 2.25 times fewer hold its surfaces."""
-
-
-def _mapped(
-    source: Source,
-    survey: Survey,
-    settings: AuditSettings,
-    step: Callable[[], None],
-    on_progress: Progress,
-) -> tuple[Survey, Seen]:
-    """Maps the capture, in larger voxels where the user leaves that open and the place is large."""
-    while True:
-        on_progress("mapping", 2 * len(survey.chosen))
-        try:
-            return survey, see(source, survey, settings.folds, step)
-        except TooManyVoxelsError:
-            if settings.voxel_size is not None or _COARSER * survey.voxel_size > LARGEST_VOXEL:
-                raise
-            survey = survey.with_voxels(_COARSER * survey.voxel_size)
 
 
 def _evaluated_frames(

@@ -24,7 +24,13 @@ from r3jax.apps.select.quality import (
 from r3jax.apps.select.settings import FRAMES, STAND, SelectSettings
 from r3jax.apps.select.targets import Targets, see_targets
 from r3jax.captures.camera_paths import path_of
-from r3jax.captures.capture_maps import join_frame, join_on_rows, map_grid
+from r3jax.captures.capture_maps import (
+    OnFrame,
+    in_fitting_voxels,
+    join_frame,
+    join_on_rows,
+    map_grid,
+)
 from r3jax.captures.faults.blocks import BlockImage, block_image
 from r3jax.captures.source import Picture, Source, thinned
 from r3jax.captures.standpoints import places_of
@@ -122,8 +128,12 @@ def select(
     step = lambda: on_progress("", 1)
     on_progress("examining the capture", 0)
     survey = survey_of(source, settings)
-    on_progress("reading frames", len(survey.chosen))
-    whole, images, fine, unread = _surfaces(source, survey, step)
+
+    def mapped(survey: Survey, on_frame: OnFrame) -> _Surfaces:
+        on_progress("reading frames", len(survey.chosen))
+        return _surfaces(source, survey, on_frame)
+
+    survey, (whole, images, fine, unread) = in_fitting_voxels(survey, settings, mapped, step)
     used = np.setdiff1d(survey.chosen, list(unread))
     if len(used) < 2:
         raise next(iter(unread.values()), FormatError(Path(source.name), "fewer than two frames"))
@@ -170,9 +180,10 @@ def select(
     )  # fmt: skip
 
 
-def _surfaces(
-    source: Source, survey: Survey, on_frame: Callable[[], None]
-) -> tuple[MapState, list[BlockImage], list[float], dict[int, FormatError]]:
+_Surfaces = tuple[MapState, list[BlockImage], list[float], dict[int, FormatError]]
+
+
+def _surfaces(source: Source, survey: Survey, on_frame: OnFrame) -> _Surfaces:
     """Maps all frames; also returns their block images, their fineness, and unreadable frames."""
     images: list[BlockImage] = []
     fine: list[float] = []
