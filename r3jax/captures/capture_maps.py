@@ -77,7 +77,7 @@ def in_fitting_voxels(
 
     Args:
         survey: the images to use and the resolution.
-        settings: what the user asked for.
+        settings: the user's choices.
         make: makes the map from all images; called again after an overflow.
         on_frame: progress callback.
 
