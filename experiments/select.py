@@ -494,6 +494,8 @@ def main(options: Options) -> None:
     """Runs what is left, and writes the tables."""
     if unknown := set(options.choosers) - set(CHOICES):
         raise InputError(f"unknown choosers: {', '.join(sorted(unknown))}")
+    if not (options.captures or options.only_table):
+        raise InputError("no captures: name them, or give --only-table")
     make_folder(options.out)
     path = options.out / "records.jsonl"
     if not options.only_table:

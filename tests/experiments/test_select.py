@@ -96,3 +96,8 @@ def test_a_gain_of_each_channel_does_not_count_where_exposures_differ():
 def test_an_unknown_chooser_is_refused(options):
     with pytest.raises(ValueError, match="nobody"):
         main(dataclasses.replace(options, choosers=("nobody",)))
+
+
+def test_no_captures_are_refused_unless_only_the_tables_are_wanted(options):
+    with pytest.raises(ValueError, match="--only-table"):
+        main(dataclasses.replace(options, captures=()))
