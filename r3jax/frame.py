@@ -7,7 +7,9 @@ copied: camera drivers reuse their buffers, and JAX arrays must never change.
 Shape symbols: H W image size.
 """
 
-from typing import Any
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -444,3 +446,18 @@ def _float32(array: np.ndarray | Array) -> np.ndarray | Array:
     if isinstance(array, np.ndarray):
         return np.array(array, dtype=np.float32)
     return array.astype(jnp.float32)
+
+
+_END: Any = object()
+
+Read = TypeVar("Read")
+
+
+def read_ahead(frames: Iterable[Read]) -> Iterator[Read]:
+    """Yields the same frames, each read in a thread while the one before it is used."""
+    frames = iter(frames)
+    with ThreadPoolExecutor(1, thread_name_prefix="frames") as reader:
+        coming = reader.submit(next, frames, _END)
+        while (frame := coming.result()) is not _END:
+            coming = reader.submit(next, frames, _END)
+            yield frame

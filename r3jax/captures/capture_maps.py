@@ -14,21 +14,25 @@ Shape symbols: N rows; F folds.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
+from itertools import islice
 from typing import TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
+from r3jax.captures.neighborhoods import Neighborhood, divided, neighborhoods
 from r3jax.captures.settings import SurveySettings
 from r3jax.captures.source import Source
 from r3jax.captures.survey import LARGEST_VOXEL, MARGIN, RANGE, Survey
 from r3jax.errors import InputError
-from r3jax.frame import Frame
+from r3jax.frame import Frame, read_ahead
 from r3jax.kernels import calls
 from r3jax.kernels.native.platform import by_platform
 from r3jax.mapping.join import combine_moments
@@ -41,7 +45,8 @@ from r3jax.mapping.occupancy import (
 )
 from r3jax.mapping.seen import hidden_by_none, mark_seen
 from r3jax.mapping.state import MapState, empty_map
-from r3jax.mapping.update import add_pixels, for_kernels, update_growing, with_rows
+from r3jax.mapping.tiles import Union
+from r3jax.mapping.update import MAX_LOAD, add_pixels, for_kernels, update_growing, with_rows
 
 _CAPACITY = 1 << 15
 _MOST_ROWS = 1 << 22
@@ -63,6 +68,9 @@ _COARSER = 1.5
 surfaces."""
 
 Mapped = TypeVar("Mapped")
+
+Window = tuple[int, int, int]
+"""Number of cells along each axis."""
 
 
 def in_fitting_voxels(
@@ -99,7 +107,7 @@ def in_fitting_voxels(
             size = survey.voxel_size
             if settings.voxel_size is not None or _COARSER * size > LARGEST_VOXEL:
                 raise
-            factor = max(_COARSER, math.sqrt(len(survey.chosen) / (done + 1)))
+            factor = max(_COARSER, math.sqrt(len(survey.chosen) / max(done, 1)))
             survey = survey.with_voxels(min(factor * size, LARGEST_VOXEL))
 
 
@@ -139,24 +147,103 @@ def see(source: Source, survey: Survey, folds: int, on_frame: OnFrame = lambda: 
     """
     whole, grid = _surfaces(source, survey, on_frame)
     count = min(folds, len(survey.chosen))
-    parts = [blank(whole)] * count
+    parts = [blank(whole) for _ in range(count)]
     fold_of = np.arange(len(survey.chosen)) % count
-    for fold, index in zip(fold_of.tolist(), survey.chosen.tolist(), strict=True):
-        frame = source.frame(index, survey.alignment)
-        parts[fold] = join_frame(parts[fold], whole, source, frame)
-        on_frame()
+    order = np.concatenate(divided(_eyes(source, survey), RANGE))
+    numbers = survey.chosen[order].tolist()
+    frames = read_ahead(source.frame(index, survey.alignment) for index in numbers)
+    for near in neighborhoods_of(whole, source, survey, for_lookups=True):
+        own = [near.part_of(part) for part in parts]
+        for fold, frame in zip(fold_of[near.numbers], frames, strict=False):
+            own[fold] = join_frame(own[fold], near.state, source, frame)
+            on_frame()
+        parts = [near.put_into(part, new) for part, new in zip(parts, own, strict=True)]
     return Seen(united(parts), grid, tuple(parts), fold_of)
 
 
+def neighborhoods_of(
+    whole: MapState, source: Source, survey: Survey, *, for_lookups: bool
+) -> Iterator[Neighborhood]:
+    """Yields the neighborhoods of the images used, numbered in the order of `Survey.chosen`."""
+    cameras = map(source.camera, survey.chosen.tolist())
+    return neighborhoods(whole, _eyes(source, survey), cameras, RANGE, for_lookups=for_lookups)
+
+
+def _eyes(source: Source, survey: Survey) -> np.ndarray:
+    return survey.alignment.points(source.poses[survey.chosen, :3, 3])
+
+
 def _surfaces(source: Source, survey: Survey, on_frame: OnFrame) -> tuple[MapState, OccupancyGrid]:
-    state = empty_map(_CAPACITY, survey.voxel_size)
     grid = empty_grid(survey.bounds, survey.cell_size)
-    for index in survey.chosen.tolist():
-        frame = source.frame(index, survey.alignment)
-        state = grown(state, frame, source.is_dense)
+
+    def update(frame: Frame) -> None:
+        nonlocal grid
         grid = _update_grid(grid, source, frame)
         on_frame()
+
+    state = map_of_images(source, survey, update)
     return state, _with_cameras(grid, source, survey)
+
+
+def map_of_images(
+    source: Source, survey: Survey, on_frame: Callable[[Frame], None] = lambda frame: None
+) -> MapState:
+    """Maps all images.
+
+    Args:
+        source: the images.
+        survey: the images to use and the resolution.
+        on_frame: called with each image.
+
+    Raises:
+        FormatError, RunError: a file is missing or broken.
+        ValueError: there are more voxels than with any reasonable voxel size.
+    """
+    groups = divided(_eyes(source, survey), RANGE)
+
+    def frames() -> Iterator[Frame]:
+        numbers = survey.chosen[np.concatenate(groups)].tolist()
+        for frame in read_ahead(source.frame(index, survey.alignment) for index in numbers):
+            on_frame(frame)
+            yield frame
+
+    return map_of_all(frames(), groups, survey.voxel_size, drop_edges=source.is_dense)
+
+
+def map_of_all(
+    frames: Iterator[Frame | None],
+    groups: Sequence[np.ndarray],
+    voxel_size: float,
+    *,
+    max_range: float = RANGE,
+    drop_edges: bool = True,
+) -> MapState:
+    """Maps all frames, one neighborhood after the other.
+
+    Args:
+        frames: the frames in the order of the groups; None for those that cannot be read.
+        groups: `divided` cameras.
+        voxel_size: edge of a voxel.
+        max_range: surfaces farther than this do not count.
+        drop_edges: False to include pixels on depth edges.
+
+    Raises:
+        ValueError: there are more voxels than with any reasonable voxel size.
+    """
+    part, union = empty_map(_CAPACITY, voxel_size), Union(int(MAX_LOAD * _MOST_ROWS))
+    for numbers in groups:
+        # The next one begins with what this one needed: growing maps a frame twice.
+        part = empty_map(part.capacity, voxel_size)
+        for frame in islice(frames, len(numbers)):
+            if frame is not None:
+                part = _grown(part, frame, drop_edges, max_range)
+        if len(groups) > 1:
+            with _overflow():
+                union.add(part)
+    if len(groups) == 1:
+        return part
+    with _overflow():
+        return union.table(part)
 
 
 def map_grid(source: Source, survey: Survey, numbers: np.ndarray) -> OccupancyGrid:
@@ -173,11 +260,35 @@ def map_grid(source: Source, survey: Survey, numbers: np.ndarray) -> OccupancyGr
 
 def _update_grid(grid: OccupancyGrid, source: Source, frame: Frame) -> OccupancyGrid:
     if source.is_dense:
-        return _integrate_depth(grid, frame, jnp.float32(RANGE))
+        start, size = window_of(grid, np.asarray(frame.position))
+        return _integrate_depth(grid, frame, start, size)
     return integrate_rays(grid, np.asarray(frame.position), _measured_points(frame))
 
 
-_integrate_depth = jax.jit(integrate_depth)
+@partial(jax.jit, static_argnames="size")
+def _integrate_depth(
+    grid: OccupancyGrid, frame: Frame, start: Int[Array, " 3"], size: Window
+) -> OccupancyGrid:
+    near = integrate_depth(cut_grid(grid, start, size), frame, jnp.float32(RANGE))
+    log_odds = jax.lax.dynamic_update_slice(grid.log_odds, near.log_odds, start)
+    return eqx.tree_at(lambda g: g.log_odds, grid, log_odds)
+
+
+def window_of(grid: OccupancyGrid, eye: np.ndarray) -> tuple[np.ndarray, Window]:
+    """Finds the cells within range of a camera: the first along each axis [3], and how many."""
+    shape, cell = np.array(grid.log_odds.shape), float(grid.cell_size)
+    size = np.minimum(shape, 2 * int(np.ceil(RANGE / cell)) + 3)
+    first = np.floor((eye - np.asarray(grid.origin) - RANGE) / cell) - 1
+    x, y, z = size.tolist()
+    return np.clip(first, 0, shape - size).astype(np.int32), (x, y, z)
+
+
+@partial(jax.jit, static_argnames="size")
+def cut_grid(grid: OccupancyGrid, start: Int[Array, " 3"], size: Window) -> OccupancyGrid:
+    """Cuts cells out of a grid without masks: from `start` on, `size` along each axis."""
+    origin = grid.origin + start.astype(jnp.float32) * grid.cell_size
+    log_odds = jax.lax.dynamic_slice(grid.log_odds, start, size)
+    return OccupancyGrid(log_odds, origin, grid.cell_size)
 
 
 def _with_cameras(grid: OccupancyGrid, source: Source, survey: Survey) -> OccupancyGrid:
@@ -268,15 +379,22 @@ def free_round(grid: OccupancyGrid, cameras: np.ndarray) -> OccupancyGrid:
     return eqx.tree_at(lambda g: g.log_odds, grid, jnp.asarray(log_odds))
 
 
-def grown(state: MapState, frame: Frame, drop_edges: bool, max_range: float = RANGE) -> MapState:
+def _grown(state: MapState, frame: Frame, drop_edges: bool, max_range: float) -> MapState:
     """Returns the map with a frame's pixels added, in a larger table if needed.
 
     Raises:
         ValueError: there are more voxels than with any reasonable voxel size.
     """
     arguments = frame, jnp.float32(max_range), jnp.asarray(drop_edges)
-    try:
+    with _overflow():
         return update_growing(lambda now: _add_pixels(now, *arguments), state, _MOST_ROWS)
+
+
+@contextmanager
+def _overflow() -> Generator[None]:
+    """Says what to do about more voxels than fit."""
+    try:
+        yield
     except ValueError as error:
         raise TooManyVoxelsError(
             f"the capture fills more than {_MOST_ROWS} voxels: choose a larger --voxel-size"

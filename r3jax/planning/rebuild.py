@@ -1,9 +1,7 @@
 """Rebuilds the map from corrected key frames after a loop closure: voxels cannot be moved."""
 
-from collections.abc import Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,13 +11,11 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from r3jax.errors import InputError
-from r3jax.frame import Frame
+from r3jax.frame import Frame, read_ahead
 from r3jax.geometry.arguments import checked
 from r3jax.mapping.tile_files import Voxels
 from r3jax.planning.far import NO_VIEWS
 from r3jax.planning.planner import Planner, a_planner, first_map, mark_starts, take_in
-
-_END: Any = object()
 
 
 @checked(planner=a_planner)
@@ -51,7 +47,7 @@ def rebuild(
     Raises:
         ValueError: no frame.
     """
-    frames = _read_ahead(frames)
+    frames = read_ahead(frames)
     first = next(frames, None)
     if first is None:
         raise InputError("rebuild needs at least one frame")
@@ -75,13 +71,3 @@ def rebuild(
     for frame in frames:
         after = take_in(after, frame)
     return after
-
-
-def _read_ahead(frames: Iterable[Frame]) -> Iterator[Frame]:
-    """Yields the same frames, each read in a thread while the one before it is used."""
-    frames = iter(frames)
-    with ThreadPoolExecutor(1, thread_name_prefix="frames") as reader:
-        coming = reader.submit(next, frames, _END)
-        while (frame := coming.result()) is not _END:
-            coming = reader.submit(next, frames, _END)
-            yield frame

@@ -60,23 +60,24 @@ def consistency(
 
 def score_voxels(
     voxels: MapState,
-    camera_position: Float[Array, " 3"],
+    camera_position: Float[Array, " 3"] | Float[Array, "3 n"],
     focal: Float[Array, ""],
     score: Score = PAPER,
     kappa_is_one: Bool[Array, " n"] | None = None,
 ) -> Renderability:
-    """Computes the terms of every voxel as seen from one camera position.
+    """Computes the terms of every voxel as seen from one camera position, or from one of its own.
 
     Args:
         voxels: their statistics.
-        camera_position: camera center [m].
+        camera_position: camera center, or one for each voxel [m].
         focal: its focal length [px], in the unit used when the map was made.
         score: forms of kappa and delta, powers of the terms, and another R than their product.
         kappa_is_one: whether kappa is 1, if it was determined before; None: computed here.
     """
     delta = consistency(voxels.count, voxels.m2, score.forms.delta)
     # From the voxel to the camera, as the visited bins were recorded.
-    offset = camera_position[:, None] - voxels.center
+    position = camera_position if camera_position.ndim == 2 else camera_position[:, None]
+    offset = position - voxels.center
     distance = jnp.maximum(safe_norm(offset, axis=0), 1e-6)
     direction = offset / distance[None, :]
     cosine, inside = seen_directions(voxels.visited, direction, voxels.num_bins)

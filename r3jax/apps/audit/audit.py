@@ -5,7 +5,7 @@ Shape symbols: n frames of the evaluated path.
 
 import dataclasses
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import jax.numpy as jnp
@@ -13,7 +13,6 @@ import numpy as np
 
 from r3jax.apps.audit.diagnosis import (
     NOT_KNOWN,
-    Demand,
     Diagnosis,
     Pictures,
     Region,
@@ -30,8 +29,18 @@ from r3jax.apps.audit.diagnosis import (
 from r3jax.apps.audit.settings import AuditSettings
 from r3jax.apps.audit.suggest import SuggestedViews, Task, suggest
 from r3jax.captures.camera_paths import CameraPath
-from r3jax.captures.capture_maps import OnFrame, Seen, in_fitting_voxels, see
+from r3jax.captures.capture_maps import (
+    OnFrame,
+    Seen,
+    cut_grid,
+    in_fitting_voxels,
+    neighborhoods_of,
+    see,
+    united,
+    window_of,
+)
 from r3jax.captures.faults.faults import Faults, find_faults, stray_finding
+from r3jax.captures.neighborhoods import Neighborhood, divided, neighborhoods
 from r3jax.captures.source import Source, thinned
 from r3jax.captures.standpoints import Places, inward_center, places_of
 from r3jax.captures.surfaces import with_surfaces
@@ -221,15 +230,17 @@ def audit(
         meter=survey.alignment.scale if source.is_metric else None,
         center=center,
         with_cameras=True,
-        num_standpoints=settings.num_standpoints,
+        num_standpoints=_num_standpoints(settings, cameras),
     )
-    on_progress("evaluating frames", 0)
-    frames = tuple(_evaluated_frames(source, survey, seen, config, path, step, on_progress))
+    on_progress("evaluating frames", len(survey.chosen if path is None else path.poses))
+    if path is None:
+        frames = _evaluated_frames(source, survey, seen, config, step)
+    else:
+        frames = _evaluated_path(source, survey, seen, config, path, step)
     open_grid = _open_grid(source, survey, seen, cameras, config)
     on_progress("choosing views", settings.views)
-    demand = demand_of(seen.state, places.standpoints, config)
-    known = jnp.asarray(known_rows(seen.state, source.is_complete))
-    task = Task(camera, Demand(demand.position, demand.visible & known[None]), config)
+    known = known_rows(seen.state, source.is_complete)
+    task = Task(camera, demand_of(seen.state, places.standpoints, config, known), config)
     plan = suggest(
         seen.state,
         open_grid,
@@ -249,7 +260,7 @@ def audit(
         lens=lens,
         places=places,
         is_object=center is not None,
-        frames=frames,
+        frames=tuple(frames),
         is_own_path=path is None,
         regions=tuple(bad_regions(seen.state, plan.before)),
         unseen=tuple(unseen_regions(seen.grid, edges)),
@@ -258,6 +269,16 @@ def audit(
         plan=plan,
         faults=faults,
     )
+
+
+def _num_standpoints(settings: AuditSettings, cameras: np.ndarray) -> int:
+    """Chooses the number of standpoints: in a building as many on the same floor as in a flat."""
+    return settings.num_standpoints * max(1, round(len(divided(cameras, RANGE)) / _CUBES))
+
+
+_CUBES = 16
+"""Cubes of a range's edge in the largest place for which `AuditSettings.num_standpoints` suffice: a
+house of 20 m."""
 
 
 def _survey(
@@ -287,49 +308,59 @@ def _survey(
     return source, survey, faults
 
 
-def _evaluated_frames(
+def _evaluated_path(
     source: Source,
     survey: Survey,
     seen: Seen,
     config: ScoringConfig,
-    path: CameraPath | None,
+    path: CameraPath,
     step: Callable[[], None],
-    on_progress: Progress,
-) -> Iterator[EvaluatedFrame]:
-    """Yields the evaluated frames of the path.
-
-    The capture's own frames are evaluated on the map without their fold.
-    """
-    taken = survey.alignment.poses(source.poses[survey.chosen])
-
-    def pictures(numbers: np.ndarray) -> Pictures | None:
-        if source.is_complete:
-            return None
-        cameras = [source.camera(index) for index in survey.chosen[numbers].tolist()]
-        return Pictures(known_rows(seen.state, is_complete=False), cameras, taken[numbers])
-
-    if path is not None:
-        on_progress("evaluating frames", len(path.poses))
-        poses = survey.alignment.poses(path.poses)
-        shown = pictures(np.arange(len(survey.chosen)))
-        for index, (pose, lens) in enumerate(zip(poses, path.lenses, strict=True)):
-            camera = thinned(lens.camera, source.stride)
-            score = view_score(seen.state, camera, pose, config, shown)
-            yield EvaluatedFrame(index, f"frame {index + 1}", pose, score)
-            step()
-        return
-    on_progress("evaluating frames", len(survey.chosen))
+) -> list[EvaluatedFrame]:
+    """Evaluates the frames of a camera path on the map of all pictures."""
+    poses = survey.alignment.poses(path.poses)
+    cameras = [thinned(lens.camera, source.stride) for lens in path.lenses]
     found: dict[int, EvaluatedFrame] = {}
-    for fold in range(len(seen.folds)):
-        others = seen.without(fold)
-        shown = pictures(np.flatnonzero(seen.fold_of != fold))
-        for place in np.flatnonzero(seen.fold_of == fold).tolist():
-            index = int(survey.chosen[place])
-            depth = None if shown is None else survey.alignment.scale * source.read(index)[1]
-            score = view_score(others, source.camera(index), taken[place], config, shown, depth)
-            found[place] = EvaluatedFrame(index, source.labels[index], taken[place], score)
+    every = np.arange(len(survey.chosen))
+    for near in neighborhoods(seen.state, poses[:, :3, 3], cameras, RANGE, for_lookups=False):
+        shown = _pictures(source, survey, seen, near, every)
+        for index in near.numbers.tolist():
+            score = view_score(near.state, cameras[index], poses[index], config, shown)
+            found[index] = EvaluatedFrame(index, f"frame {index + 1}", poses[index], score)
             step()
-    yield from (found[place] for place in sorted(found))
+    return [found[index] for index in sorted(found)]
+
+
+def _evaluated_frames(
+    source: Source, survey: Survey, seen: Seen, config: ScoringConfig, step: Callable[[], None]
+) -> list[EvaluatedFrame]:
+    """Evaluates the capture's own frames, each on the map without its fold."""
+    poses = survey.alignment.poses(source.poses[survey.chosen])
+    found: dict[int, EvaluatedFrame] = {}
+    for near in neighborhoods_of(seen.state, source, survey, for_lookups=False):
+        parts = [near.part_of(part) for part in seen.folds]
+        for fold in np.unique(seen.fold_of[near.numbers]).tolist():
+            others = united([part for i, part in enumerate(parts) if i != fold])
+            shown = _pictures(source, survey, seen, near, np.flatnonzero(seen.fold_of != fold))
+            for place in near.numbers[seen.fold_of[near.numbers] == fold].tolist():
+                index = int(survey.chosen[place])
+                depth = None if shown is None else survey.alignment.scale * source.read(index)[1]
+                camera = source.camera(index)
+                score = view_score(others, camera, poses[place], config, shown, depth)
+                found[place] = EvaluatedFrame(index, source.labels[index], poses[place], score)
+                step()
+    return [found[place] for place in sorted(found)]
+
+
+def _pictures(
+    source: Source, survey: Survey, seen: Seen, near: Neighborhood, numbers: np.ndarray
+) -> Pictures | None:
+    """Lists some pictures of a map in which surfaces may be unknown; None if all are known."""
+    if source.is_complete:
+        return None
+    known = near.values_of(known_rows(seen.state, is_complete=False))
+    chosen = survey.chosen[numbers]
+    poses = survey.alignment.poses(source.poses[chosen])
+    return Pictures(known, [source.camera(index) for index in chosen.tolist()], poses)
 
 
 def _blank_regions(
@@ -337,11 +368,13 @@ def _blank_regions(
 ) -> tuple[Region, ...]:
     known = known_rows(seen.state, is_complete=False)
     poses = survey.alignment.poses(source.poses[survey.chosen])
-    points = [
-        blank_points(seen.state, known, source.camera(index), pose, config)
-        for index, pose in zip(survey.chosen.tolist(), poses, strict=True)
-    ]
-    return tuple(blank_regions(seen.state, points))
+    points: dict[int, np.ndarray] = {}
+    for near in neighborhoods_of(seen.state, source, survey, for_lookups=False):
+        own = near.values_of(known)
+        for i in near.numbers.tolist():
+            camera = source.camera(int(survey.chosen[i]))
+            points[i] = blank_points(near.state, own, camera, poses[i], config)
+    return tuple(blank_regions(seen.state, list(points.values())))
 
 
 def _open_grid(
@@ -360,9 +393,13 @@ def _open_grid(
     reached[tuple(cells.T)] = True
     looks = np.zeros(grid.log_odds.shape, dtype=np.int32)
     poses = survey.alignment.poses(source.poses[survey.chosen])
-    for index, pose in zip(survey.chosen.tolist(), poses, strict=True):
-        T = jnp.asarray(pose, dtype=jnp.float32)
-        looks += np.asarray(visible_unexplored(seen.state, grid, source.camera(index), T, config))
+    for near in neighborhoods_of(seen.state, source, survey, for_lookups=False):
+        for i in near.numbers.tolist():
+            camera, T = source.camera(int(survey.chosen[i])), jnp.asarray(poses[i], jnp.float32)
+            start, size = window_of(grid, poses[i, :3, 3])
+            part = visible_unexplored(near.state, cut_grid(grid, start, size), camera, T, config)
+            at = tuple(slice(a, a + n) for a, n in zip(start.tolist(), size, strict=True))
+            looks[at] += np.asarray(part)
     explorable = np.asarray(mask_unexplorable(grid, reached, looks >= _MAX_FAILED_LOOKS).unexplored)
     edges = unseen_edges(grid, explorable)
     return grid.ignoring(~edges)

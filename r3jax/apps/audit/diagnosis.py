@@ -5,7 +5,8 @@ here are spread over the places near the pictures where a person could stand
 (`captures.standpoints`). The scores of each voxel are averaged over the standpoints that see it.
 Regions are blocks of voxels with a large deficit, the worst first.
 
-Shape symbols: N rows of the map; p standpoints; m bad voxels; X Y Z cells of the coarse grid.
+Shape symbols: N rows of the map; p standpoints; P pairs of a standpoint and a voxel it sees; m bad
+voxels; X Y Z cells of the coarse grid.
 """
 
 import functools
@@ -25,14 +26,14 @@ from r3jax.captures.alignment import evenly_spaced
 from r3jax.captures.source import projected
 from r3jax.captures.survey import RANGE
 from r3jax.geometry.cameras import Camera
-from r3jax.geometry.selection import for_selected
+from r3jax.geometry.selection import CHUNK
 from r3jax.mapping.occupancy import OccupancyGrid, centers_on_host
 from r3jax.mapping.seen import visible_rows
 from r3jax.mapping.state import MapState
 from r3jax.scoring.batch import map_over_devices
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.renderability import term_images
-from r3jax.scoring.terms import score_voxels
+from r3jax.scoring.terms import Renderability, score_voxels
 from r3jax.visibility.views import panorama_view
 
 TERMS = ("bias", "noise", "resolution")
@@ -226,25 +227,33 @@ FEW = 3
 
 
 class Demand(eqx.Module):
-    """Standpoints from which surfaces will be viewed. Computed once, as surfaces do not move."""
+    """Which voxels will be viewed from which standpoints: pairs of both.
+
+    Computed once, as surfaces do not move. A voxel is seen from a few standpoints only: a table of
+    all voxels and standpoints would take gigabytes in a large building.
+    """
 
     position: Float[Array, "p 3"]
     """The standpoints [audit units]."""
 
-    visible: Bool[Array, "p N"]
-    """True where a standpoint sees a voxel."""
+    row: Int[Array, " P"]
+    """Row of the voxel of each pair; N in padding."""
 
-    @property
-    def num_seen(self) -> Float[Array, " N"]:
-        """Standpoints that see each voxel."""
-        return jnp.sum(self.visible, axis=0, dtype=jnp.float32)
+    standpoint: Int[Array, " P"]
+    """Index of the standpoint of each pair."""
+
+    num_seen: Float[Array, " N"]
+    """Number of standpoints that see each voxel."""
 
 
 class StandpointScores(eqx.Module):
     """Scores of the voxels from the standpoints."""
 
-    value: Float[Array, "p N"]
-    """Renderability of each voxel from each standpoint; 0 where the standpoint does not see it."""
+    value: Float[Array, " P"]
+    """Renderability of each pair of the demand."""
+
+    total: Float[Array, " N"]
+    """Sum of a voxel's values."""
 
     terms: Float[Array, "3 N"]
     """Sums of bias, noise and resolution over the standpoints that see a voxel."""
@@ -301,16 +310,42 @@ class Diagnosis:
         return float(wanted.mean()) if evaluated.any() else 0.0
 
 
-def demand_of(state: MapState, standpoints: np.ndarray, config: ScoringConfig) -> Demand:
+def demand_of(
+    state: MapState,
+    standpoints: np.ndarray,
+    config: ScoringConfig,
+    known: np.ndarray | None = None,
+) -> Demand:
     """Computes which voxels each standpoint sees.
 
     Args:
         state: the map.
         standpoints: [p, 3] [audit units].
         config: range and size of the panoramic depth buffer.
+        known: mask of the rows that count, [N]; None: all.
     """
-    position = jnp.asarray(standpoints, dtype=jnp.float32)
-    return Demand(position, map_over_devices(functools.partial(_visible, state, config), position))
+    position, rows, points = jnp.asarray(standpoints, dtype=jnp.float32), [], []
+    for start in range(0, len(position), _AT_ONCE):
+        some = position[start : start + _AT_ONCE]
+        found = np.array(map_over_devices(functools.partial(_visible, state, config), some))
+        if known is not None:
+            found &= known
+        index, row = np.nonzero(found)
+        rows.append(row)
+        points.append((index + start).astype(np.int32))
+    row, standpoint = (np.concatenate([*parts, np.zeros(0, int)]) for parts in (rows, points))
+    # To a power of two, as programs are compiled for a number of pairs.
+    blank = (1 << max(len(row) - 1, CHUNK - 1).bit_length()) - len(row)
+    return Demand(
+        position,
+        jnp.asarray(np.pad(row, (0, blank), constant_values=state.capacity), jnp.int32),
+        jnp.asarray(np.pad(standpoint, (0, blank)), jnp.int32),
+        jnp.asarray(np.bincount(row, minlength=state.capacity), jnp.float32),
+    )
+
+
+_AT_ONCE = 8
+"""Standpoints that are looked from at once: each takes a byte a row."""
 
 
 @jax.jit
@@ -324,10 +359,11 @@ def _visible(
     return jax.lax.map(seen_from, positions)
 
 
+@jax.jit
 def score_from_standpoints(
     state: MapState, demand: Demand, focal: Float[Array, ""], config: ScoringConfig
 ) -> StandpointScores:
-    """Scores the voxels of the map from every standpoint.
+    """Scores the voxels of the map from every standpoint that sees them.
 
     Args:
         state: the map; its surfaces are those of the demand.
@@ -335,55 +371,34 @@ def score_from_standpoints(
         focal: focal length of the rendering camera [px], in the map's unit.
         config: settings of the closed forms.
     """
-    # Indices of the standpoints as floats, because `map_over_devices` distributes floats.
-    ids = np.arange(demand.position.shape[0], dtype=np.float32)
-    part = functools.partial(_answers, state, demand, focal, config)
-    values, terms, costs = list[Array](), jnp.zeros(()), jnp.zeros(())
-    for some in np.split(ids, np.arange(_AT_ONCE, len(ids), _AT_ONCE)):
-        value, of_terms, of_costs = map_over_devices(part, jnp.asarray(some))
-        values.append(value)
-        terms, costs = terms + jnp.sum(of_terms, axis=0), costs + jnp.sum(of_costs, axis=0)
-    return StandpointScores(jnp.concatenate(values), terms, costs)
+
+    def score(pairs: tuple[Array, Array]) -> tuple[Array, Array]:
+        terms = score_pairs(state, demand.position, *pairs, focal, config)
+        return terms.value, jnp.stack([terms.bias, terms.noise, terms.resolution])
+
+    chunks = demand.row.reshape(-1, CHUNK), demand.standpoint.reshape(-1, CHUNK)
+    value, factors = jax.lax.map(score, chunks)
+    value, factors = value.reshape(-1), jnp.moveaxis(factors, 1, 0).reshape(3, -1)
+    costs = -jnp.log(jnp.maximum(factors, LEAST))
+
+    def summed(x: Array) -> Array:
+        return jnp.zeros((*x.shape[:-1], state.capacity)).at[..., demand.row].add(x, mode="drop")
+
+    return StandpointScores(value, summed(value), summed(factors), summed(costs))
 
 
-_AT_ONCE = 4
-"""Standpoints whose terms are summed at once: those of all would take 600 bytes a row."""
-
-
-@jax.jit
-def _answers(
-    voxels: MapState,
-    demand: Demand,
+def score_pairs(
+    state: MapState,
+    position: Float[Array, "p 3"],
+    row: Int[Array, " K"],
+    standpoint: Int[Array, " K"],
     focal: Float[Array, ""],
     config: ScoringConfig,
-    ids: Float[Array, " q"],
-) -> tuple[Float[Array, "q N"], Float[Array, "q 3 N"], Float[Array, "q 3 N"]]:
-    """Computes values, terms and costs for some of the standpoints."""
-    num = voxels.count.shape[0]
-
-    def answer(number: Float[Array, ""]) -> tuple[Array, Array, Array]:
-        index = number.astype(jnp.int32)
-        position = demand.position[index]
-
-        def score(
-            rows: Int[Array, " K"], valid: Bool[Array, " K"], found: tuple[Array, Array]
-        ) -> tuple[Array, Array]:
-            terms = score_voxels(voxels.take(rows, valid), position, focal, config.score)
-            target = jnp.where(valid, rows, num)
-            value, factors = found
-            three = jnp.stack([terms.bias, terms.noise, terms.resolution])
-            return (
-                value.at[target].set(terms.value, mode="drop"),
-                factors.at[:, target].set(three, mode="drop"),
-            )
-
-        seen = demand.visible[index] & voxels.present
-        blank = jnp.zeros(num), jnp.ones((3, num))
-        value, factors = for_selected(seen, score, blank)
-        costs = -jnp.log(jnp.maximum(factors, LEAST))
-        return value, jnp.where(seen[None, :], factors, 0.0), costs
-
-    return jax.lax.map(answer, ids)
+) -> Renderability:
+    """Computes the terms of pairs of a voxel and a standpoint; 0 where there is no such row."""
+    valid = row < state.capacity
+    part = state.take(jnp.where(valid, row, 0), valid)
+    return score_voxels(part, position[standpoint].T, focal, config.score)
 
 
 def diagnose(state: MapState, demand: Demand, answers: StandpointScores) -> Diagnosis:
@@ -395,7 +410,7 @@ def diagnose(state: MapState, demand: Demand, answers: StandpointScores) -> Diag
         answers: their scores of this map.
     """
     count = np.asarray(demand.num_seen)
-    value = np.asarray(jnp.sum(answers.value, axis=0)) / np.maximum(count, 1.0)
+    value = np.asarray(answers.total) / np.maximum(count, 1.0)
     bias, noise, resolution = np.asarray(answers.terms) / np.maximum(count, 1.0)
     directions = np.bitwise_count(np.asarray(state.visited)).sum(axis=0).astype(np.int16)
     return Diagnosis(

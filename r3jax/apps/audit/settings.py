@@ -28,7 +28,8 @@ class AuditSettings(SurveySettings):
     """Maximum number of positions searched for views."""
 
     num_standpoints: int = 24
-    """Maximum number of standpoints from which the surfaces are evaluated."""
+    """Maximum number of standpoints from which the surfaces are evaluated; proportionally more in
+    a place larger than 20 m."""
 
     seed: int = 0
     """Random seed of the random views that serve as a baseline for the suggested ones."""

@@ -47,6 +47,7 @@ from r3jax.apps.audit.diagnosis import (
     StandpointScores,
     diagnose,
     score_from_standpoints,
+    score_pairs,
 )
 from r3jax.captures.standpoints import Places
 from r3jax.frame import Frame
@@ -64,7 +65,6 @@ from r3jax.scoring.backend import rows_in_pixels
 from r3jax.scoring.batch import map_over_devices, score_positions
 from r3jax.scoring.config import ScoringConfig
 from r3jax.scoring.simulated import simulate_view
-from r3jax.scoring.terms import score_voxels
 from r3jax.scoring.utility import visible_unexplored
 from r3jax.visibility.views import pinhole_view
 
@@ -133,28 +133,22 @@ def _gains(
     poses: Float[Array, "C 4 4"],
 ) -> Float[Array, " C"]:
     weight = 1.0 / jnp.maximum(demand.num_seen, 1.0)
-    mean = weight * jnp.sum(answers.value, axis=0)
-    lacks = (demand.num_seen > 0.0) & (mean < _ENOUGH)
+    lacks = (demand.num_seen > 0.0) & (weight * answers.total < _ENOUGH)
 
     def gain(pose: Float[Array, "4 4"]) -> Float[Array, ""]:
         after, shown = simulate_view(state, camera, pose, config)
+        changed = (shown & lacks).at[demand.row].get(mode="fill", fill_value=False)
 
         def add(
-            rows: Int[Array, " K"], valid: Bool[Array, " K"], total: Float[Array, ""]
+            pairs: Int[Array, " K"], valid: Bool[Array, " K"], total: Float[Array, ""]
         ) -> Float[Array, ""]:
-            part = after.take(rows, valid)
+            row = jnp.where(valid, demand.row[pairs], state.capacity)
+            standpoint = demand.standpoint[pairs]
+            terms = score_pairs(after, demand.position, row, standpoint, camera.focal, config)
+            change = jnp.where(valid, terms.value - answers.value[pairs], 0.0)
+            return total + jnp.sum(change * weight.at[row].get(mode="fill", fill_value=0.0))
 
-            def of_standpoint(index: Int[Array, ""]) -> Float[Array, ""]:
-                position = demand.position[index]
-                value = score_voxels(part, position, camera.focal, config.score).value
-                seen = valid & demand.visible[index, rows]
-                change = jnp.where(seen, value - answers.value[index, rows], 0.0)
-                return jnp.sum(change * weight[rows])
-
-            ids = jnp.arange(demand.position.shape[0], dtype=jnp.int32)
-            return total + jnp.sum(jax.lax.map(of_standpoint, ids))
-
-        surfaces = for_selected(shown & lacks, add, jnp.zeros(()))
+        surfaces = for_selected(changed, add, jnp.zeros(()))
         cells = visible_unexplored(state, grid, camera, pose, config)
         return surfaces + config.lambda1 * jnp.sum(cells, dtype=jnp.float32)
 

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 
-from r3jax.captures.capture_maps import blank, grown
+from r3jax.captures.capture_maps import blank
+from r3jax.captures.neighborhoods import divided, neighborhoods
 from r3jax.captures.survey import RANGE
-from r3jax.frame import Frame
+from r3jax.frame import Frame, read_ahead
+from r3jax.geometry.cameras import Camera
 from r3jax.geometry.voxels import unpack, voxel_center
-from r3jax.mapping.state import MapState, empty_map
-
-_CAPACITY = 1 << 15
+from r3jax.mapping.state import MapState
 
 
 @dataclass(frozen=True)
@@ -75,57 +75,43 @@ class Observed:
         return np.repeat(np.arange(len(self)), np.diff(self.first))
 
 
-def map_frames(
-    frames: Iterable[Frame], voxel_size: float, *, max_range: float = RANGE, drop_edges: bool = True
-) -> MapState:
-    """Builds the map of all surfaces.
-
-    Args:
-        frames: the frames, one by one.
-        voxel_size: edge of a voxel.
-        max_range: surfaces farther than this do not count.
-        drop_edges: False to include pixels on depth edges.
-
-    Raises:
-        ValueError: there are more voxels than with any reasonable voxel size.
-    """
-    whole = empty_map(_CAPACITY, voxel_size)
-    for frame in frames:
-        whole = grown(whole, frame, drop_edges, max_range)
-    return whole
-
-
 def observe(
     whole: MapState,
     read: Callable[[int], Frame],
-    count: int,
+    eyes: np.ndarray,
+    cameras: Iterable[Camera],
     join: Callable[[MapState, MapState, Frame], MapState],
     on_frame: Callable[[], None] = lambda: None,
+    *,
+    max_range: float = RANGE,
 ) -> Observed:
     """Computes the observations of each frame.
 
     Args:
         whole: the map of all frames.
         read: reads the frame with an index.
-        count: number of frames, n.
+        eyes: camera centers, [n, 3].
+        cameras: their lenses.
         join: adds a frame to a map that has the rows of the map of all frames.
         on_frame: called after each frame.
+        max_range: surfaces farther than this do not count.
     """
     key, occupied = np.asarray(whole.key), ordered_rows(whole)
-    row_of = np.full(whole.capacity, -1, np.int32)
+    row_of = np.full(whole.capacity + 1, -1, np.int32)
     row_of[occupied] = np.arange(len(occupied), dtype=np.int32)
-    nothing = blank(whole)
-    parts: tuple[list[np.ndarray], ...] = tuple([] for _ in range(4))
-    position = np.empty((count, 3), np.float32)
-    for number in range(count):
-        frame = read(number)
-        position[number] = frame.position
-        for column, own in zip(parts, _part(join(nothing, whole, frame), row_of), strict=True):
-            column.append(own)
-        on_frame()
-    first = np.cumsum([0, *map(len, parts[0])])
-    size, sharp = float(whole.voxel_size), np.ones(count, np.float32)
-    row, resolution, color, is_colored = map(_joined, parts)
+    parts: dict[int, tuple[np.ndarray, ...]] = {}
+    position = np.empty((len(eyes), 3), np.float32)
+    frames = read_ahead(map(read, np.concatenate(divided(eyes, max_range)).tolist()))
+    for near in neighborhoods(whole, eyes, cameras, max_range):
+        nothing, own = blank(near.state), row_of[near.row]
+        for number, frame in zip(near.numbers.tolist(), frames, strict=False):
+            position[number] = frame.position
+            parts[number] = _part(join(nothing, near.state, frame), own)
+            on_frame()
+    columns = tuple(map(list, zip(*(parts.pop(i) for i in range(len(eyes))), strict=True)))
+    first = np.cumsum([0, *map(len, columns[0])])
+    size, sharp = float(whole.voxel_size), np.ones(len(eyes), np.float32)
+    row, resolution, color, is_colored = map(_joined, columns)
     return Observed(
         key[:, occupied], size, first, row, resolution, color, is_colored, position, sharp
     )
@@ -147,7 +133,7 @@ def ordered_rows(whole: MapState) -> np.ndarray:
 def _part(seen: MapState, row_of: np.ndarray) -> tuple[np.ndarray, ...]:
     """Reads the observations of a single frame from its map, in the order of the rows."""
     visited, count = np.asarray(seen.visited), np.asarray(seen.count)
-    at = np.flatnonzero(visited.any(axis=0))
+    at = np.flatnonzero(np.bitwise_or.reduce(visited))
     at = at[np.argsort(row_of[at], kind="stable")]
     return (
         row_of[at],

@@ -12,7 +12,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from r3jax.apps.select.choose import Choice, choose, component_of, tie_ranks
-from r3jax.apps.select.observations import Observed, map_frames, observe
+from r3jax.apps.select.observations import Observed, observe
 from r3jax.apps.select.quality import (
     Quality,
     exposures,
@@ -30,15 +30,17 @@ from r3jax.captures.capture_maps import (
     join_frame,
     join_on_rows,
     map_grid,
+    map_of_all,
 )
 from r3jax.captures.faults.blocks import BlockImage, block_image
+from r3jax.captures.neighborhoods import divided
 from r3jax.captures.source import Picture, Source, thinned
 from r3jax.captures.standpoints import places_of
 from r3jax.captures.surfaces import with_surfaces
 from r3jax.captures.survey import RANGE, Survey, survey_of
 from r3jax.errors import InputError
 from r3jax.formats.errors import FormatError
-from r3jax.frame import Frame
+from r3jax.frame import Frame, read_ahead
 from r3jax.geometry.cameras import Camera, angle_between
 from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import poses_along
@@ -140,7 +142,8 @@ def select(
     on_progress("finding what each frame shows", len(used))
     read = lambda number: source.frame(int(used[number]), survey.alignment)
     join = lambda part, whole, frame: join_frame(part, whole, source, frame)
-    observed = observe(whole, read, len(used), join, step)
+    eyes = survey.alignment.points(source.poses[used, :3, 3])
+    observed = observe(whole, read, eyes, map(source.camera, used.tolist()), join, step)
     scenes = component_of(observed)
     if scenes.max() + 1 == len(used):
         raise InputError(
@@ -185,24 +188,35 @@ _Surfaces = tuple[MapState, list[BlockImage], list[float], dict[int, FormatError
 
 def _surfaces(source: Source, survey: Survey, on_frame: OnFrame) -> _Surfaces:
     """Maps all frames; also returns their block images, their fineness, and unreadable frames."""
-    images: list[BlockImage] = []
-    fine: list[float] = []
+    images: dict[int, tuple[BlockImage, float]] = {}
     unread: dict[int, FormatError] = {}
+    groups = divided(survey.alignment.points(source.poses[survey.chosen, :3, 3]), RANGE)
+    order = np.concatenate(groups).tolist()
 
-    def frames() -> Iterator[Frame]:
-        for index in survey.chosen.tolist():
-            try:
-                picture: Picture = source.read(index)
-            except FormatError as error:
-                unread[index] = error
-            else:
-                images.append(block_image(*picture, source.camera(index), source.poses[index]))
-                fine.append(fineness(picture[0]))
-                yield source.framed(picture, index, survey.alignment)
+    def read(number: int) -> tuple[Picture, Frame] | FormatError:
+        index = int(survey.chosen[number])
+        try:
+            picture = source.read(index)
+        except FormatError as error:
+            return error
+        return picture, source.framed(picture, index, survey.alignment)
+
+    def frames() -> Iterator[Frame | None]:
+        for number, found in zip(order, read_ahead(map(read, order)), strict=True):
             on_frame()
+            index = int(survey.chosen[number])
+            if isinstance(found, FormatError):
+                unread[index] = found
+                yield None
+            else:
+                picture, frame = found
+                image = block_image(*picture, source.camera(index), source.poses[index])
+                images[number] = image, fineness(picture[0])
+                yield frame
 
-    whole = map_frames(frames(), survey.voxel_size, drop_edges=source.is_dense)
-    return whole, images, fine, unread
+    whole = map_of_all(frames(), groups, survey.voxel_size, drop_edges=source.is_dense)
+    found = [images[number] for number in sorted(images)]
+    return whole, [image for image, _ in found], [fine for _, fine in found], unread
 
 
 def _named(source: Source, used: np.ndarray, names: Sequence[str]) -> list[int]:
@@ -433,22 +447,26 @@ def select_frames(
         raise InputError(f"blur must hold a width of at least 1 px for each of the {count} frames")
     if any(not 0 <= number < count for number in keep):
         raise InputError(f"keep must hold numbers of the {count} frames, got {list(keep)}")
-    whole = map_frames(iter(frames), voxel_size, max_range=max_range)
+    own = np.stack([np.asarray(frame.T_world_camera) for frame in frames])
+    eyes, lenses = own[:, :3, 3], [frame.camera for frame in frames]
+    groups = divided(eyes, max_range)
+    read = frames.__getitem__
+    every = map(read, np.concatenate(groups).tolist())
+    whole = map_of_all(every, groups, voxel_size, max_range=max_range)
     reach, edges = jnp.float32(max_range), jnp.asarray(True)
     join = lambda part, whole, frame: join_on_rows(part, whole, frame, reach, edges, reach)
-    observed = observe(whole, lambda i: frames[i], count, join)
+    observed = observe(whole, read, eyes, lenses, join, max_range=max_range)
     observed = with_quality(observed, widths, exposures(observed))
-    own = np.stack([np.asarray(frame.T_world_camera) for frame in frames])
     poses = own if targets is None else np.asarray(targets, np.float64)
     if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not len(poses):
         raise InputError(f"targets must have shape [T, 4, 4], got {poses.shape}")
     if targets is None and camera is None:
-        cameras = [frame.camera for frame in frames]
+        cameras = lenses
     else:
         cameras = [frames[0].camera if camera is None else camera] * len(poses)
     seen = see_targets(whole, observed, cameras, poses, max_range)
     names = [f"{number:09d}" for number in range(count)]
     return choose(
         observed, seen, settings.number(count), gain=settings.wanted_gain, keep=list(keep),
-        ranks=tie_ranks(-widths, own[:, :3, 3], names), is_exact=exact,
+        ranks=tie_ranks(-widths, eyes, names), is_exact=exact,
     )  # fmt: skip

@@ -3,7 +3,7 @@
 Shape symbols: T targets; P pairs of a row and a target that shows it; N rows; h w buffer size.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from r3jax.apps.select.observations import Observed, ordered_rows
+from r3jax.captures.neighborhoods import neighborhoods
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.state import MapState
 from r3jax.scoring.backend import rows_in_pixels
@@ -72,22 +73,19 @@ def see_targets(
         max_range: surfaces farther than this are not visible.
     """
     config = ScoringConfig(max_range=max_range, zbuffer_size=BUFFER)
-    row_of = np.full(whole.capacity, -1, np.int64)
+    row_of = np.full(whole.capacity + 1, -1, np.int64)
     row_of[ordered_rows(whole)] = np.arange(observed.num_rows)
     pairs: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    begin = 0
-    # Cameras of one size compile to one program.
-    for _, group in groupby(cameras, key=_as_key):
-        size = len(list(group))
-        T = jnp.asarray(poses[begin : begin + size], dtype=jnp.float32)
-        for start in range(0, size, _AT_ONCE):
-            some = T[np.minimum(np.arange(start, start + _AT_ONCE), size - 1)]
-            images = np.asarray(_draw(whole, cameras[begin], some, config))
-            for number, image in enumerate(images[: size - start], start=begin + start):
-                shown, pixels = np.unique(image[image < whole.capacity], return_counts=True)
+    T = jnp.asarray(poses, dtype=jnp.float32)
+    for near in neighborhoods(whole, poses[:, :3, 3], cameras, max_range, for_lookups=False):
+        own = row_of[near.row]
+        for some in _batches(cameras, near.numbers):
+            padded = np.resize(some, _AT_ONCE)
+            images = np.asarray(_draw(near.state, cameras[some[0]], T[padded], config))
+            for number, image in zip(some, images, strict=False):
+                shown, pixels = np.unique(image[image < near.state.capacity], return_counts=True)
                 share = (pixels / image.size).astype(np.float32)
-                pairs.append((row_of[shown], np.full(len(shown), number, np.int32), share))
-        begin += size
+                pairs.append((own[shown], np.full(len(shown), number, np.int32), share))
     row, target, weight = (np.concatenate(column) for column in zip(*pairs, strict=True))
     order = np.lexsort((target, row))
     first = np.searchsorted(row[order], np.arange(observed.num_rows + 1))
@@ -98,6 +96,13 @@ def see_targets(
         target=target[order],
         weight=weight[order],
     )
+
+
+def _batches(cameras: Sequence[Camera], numbers: np.ndarray) -> Iterator[list[int]]:
+    """Yields the numbers of a few views of the same lens at a time: one program draws them."""
+    for _, group in groupby(numbers.tolist(), key=lambda number: _as_key(cameras[number])):
+        some = list(group)
+        yield from (some[i : i + _AT_ONCE] for i in range(0, len(some), _AT_ONCE))
 
 
 def _as_key(camera: Camera) -> tuple[int | float, ...]:

@@ -34,7 +34,7 @@ from r3jax.apps.viewer.drawing import (
 from r3jax.apps.viewer.layout import dock_panel, place_eye
 from r3jax.apps.viewer.server import close_server, open_server, url_of
 from r3jax.captures.alignment import Alignment
-from r3jax.captures.capture_maps import grown
+from r3jax.captures.capture_maps import map_of_images
 from r3jax.captures.settings import SurveySettings
 from r3jax.captures.source import Source, projected, source_of
 from r3jax.captures.survey import survey_of
@@ -42,7 +42,6 @@ from r3jax.errors import InputError
 from r3jax.formats.captures import open_capture
 from r3jax.formats.nerfstudio import OPENGL_FROM_OPENCV
 from r3jax.formats.points import read_point_table, read_points
-from r3jax.mapping.state import empty_map
 from r3jax.plots.page import data_url, render_macro
 from r3jax.plots.pictures import png
 from r3jax.splatting.ply import read_scene
@@ -51,8 +50,6 @@ from r3jax.validation.files import read_bytes
 from r3jax.validation.json_text import parse_json
 
 _MAX_BYTES = 1 << 26
-
-_CAPACITY = 1 << 15
 
 _SPREAD = 0.75
 """Maximum distance of a voxel's center from the ray of a click [voxels]."""
@@ -253,9 +250,7 @@ def map_recording(path: Path) -> Scan:
     capture = open_capture(path, "z")
     source = source_of(capture.source, capture.name)
     survey = survey_of(source, SurveySettings())
-    state = empty_map(_CAPACITY, survey.voxel_size)
-    for index in survey.chosen.tolist():
-        state = grown(state, source.frame(index, survey.alignment), source.is_dense)
+    state = map_of_images(source, survey)
     present = np.asarray(state.present)
     colors = to_bytes(np.asarray(state.mean).T)
     return Scan(
