@@ -330,11 +330,24 @@ def _reasons(found: Selected, known: dict[int, str]) -> dict[int, str]:
             reasons[index] = f"blurred by {quality.blur[i]:.1f} px"
         elif twin is not None:
             reasons[index] = f"twin of {source.labels[used[twin]]}"
-        elif share < 0.0005:
-            reasons[index] = "adds nothing"
         else:
-            reasons[index] = f"adds {100 * share:.1f} %"
+            reasons[index] = _adds(share, len(used))
     return reasons
+
+
+_NOTHING = 0.02
+"""A frame adds nothing if it adds less than this part of what a frame of the capture gives on
+average. Of a share of the whole, each of 5,000 frames would add nothing."""
+
+
+def _adds(share: float, num: int) -> str:
+    """Says what one more frame would add, as a share of what all `num` frames give."""
+    if share < _NOTHING / num:
+        return "adds nothing"
+    percent = 100.0 * share
+    if percent < 0.1:
+        return f"adds {np.format_float_positional(percent, 1, fractional=False, trim='-')} %"
+    return f"adds {percent:.1f} %"
 
 
 def _twin(found: Selected, frame: int) -> int | None:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import r3jax
+from r3jax.apps.select.select import _adds
 from tests.apps.audit.room import FOCAL, HEIGHT, WIDTH, picture, round_poses
 
 K = [[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0]]
@@ -73,3 +74,11 @@ def test_wrong_arguments_are_refused(frames, settings, named):
 def test_no_frames_are_refused():
     with pytest.raises(ValueError, match="no frames"):
         r3jax.select_frames([])
+
+
+@pytest.mark.parametrize("num", [10, 300, 5_000, 200_000])
+def test_what_a_frame_of_average_use_adds_is_never_nothing(num):
+    word, percent, _ = _adds(1.0 / num, num).split()
+    assert word == "adds"
+    assert float(percent) == pytest.approx(100.0 / num, rel=0.35)  # one digit
+    assert _adds(0.01 / num, num) == "adds nothing"
