@@ -151,10 +151,23 @@ def open_capture(
         return Capture(path, read_recording(path, up))
     for fits, read in _FORMATS:
         if fits(path):
-            return Capture(path, cut_wide(read(path).fitted(), cut))
+            try:
+                return Capture(path, cut_wide(read(path).fitted(), cut))
+            except FormatError as error:
+                raise _with_model_beside(error, path, read) from error
     check_capture(path)
     guess = _below(path) or nearest_guess(path)
     raise FormatError(path, guess or f"this is neither {_KNOWN}")
+
+
+def _with_model_beside(
+    error: FormatError, path: Path, read: Callable[[Path], PosedImages]
+) -> FormatError:
+    """Names the COLMAP model of a folder whose transforms.json cannot be read, if it has one."""
+    model = find_model(path)
+    if read is not read_transforms or model is None:
+        return error
+    return FormatError(error.path, f"{error.reason}; its COLMAP model may be whole: give {model}")
 
 
 def _below(path: Path) -> str | None:

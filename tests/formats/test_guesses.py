@@ -123,3 +123,14 @@ def test_a_model_of_colmap_beside_raw_data_goes_first(tmp_path):
     lay_out(tmp_path, files | {"sparse/0/cameras.bin": b"", "sparse/0/images.bin": b""})
     with pytest.raises(FormatError, match=r"sparse/0/\w+\.bin"):
         open_capture(tmp_path)
+
+
+def test_a_transforms_json_that_cannot_be_read_names_the_colmap_model_beside_it(tmp_path):
+    model = {f"sparse/0/{name}.txt": b"" for name in ("cameras", "images", "points3D")}
+    lay_out(tmp_path, model | {"transforms.json": b'{"frames": [{"file_path": "/them/1.jpeg"}]}'})
+    with pytest.raises(FormatError, match=r"its COLMAP model may be whole: give .*sparse"):
+        open_capture(tmp_path)
+    (tmp_path / "sparse/0/cameras.txt").unlink()
+    with pytest.raises(FormatError) as error:
+        open_capture(tmp_path)
+    assert "COLMAP" not in str(error.value)
