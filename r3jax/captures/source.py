@@ -313,6 +313,13 @@ class Source:
 
         return dataclasses.replace(self, read=read)
 
+    def try_read(self, index: int) -> Picture | FormatError:
+        """Reads one thinned image, or returns why it cannot be read."""
+        try:
+            return self.read(index)
+        except FormatError as error:
+            return error
+
     def frame(self, index: int, alignment: Alignment) -> Frame:
         """Reads one image in the audit's coordinates.
 

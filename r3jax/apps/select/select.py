@@ -195,10 +195,9 @@ def _surfaces(source: Source, survey: Survey, on_frame: OnFrame) -> _Surfaces:
 
     def read(number: int) -> tuple[Picture, Frame] | FormatError:
         index = int(survey.chosen[number])
-        try:
-            picture = source.read(index)
-        except FormatError as error:
-            return error
+        picture = source.try_read(index)
+        if isinstance(picture, FormatError):
+            return picture
         return picture, source.framed(picture, index, survey.alignment)
 
     def frames() -> Iterator[Frame | None]:

@@ -28,6 +28,7 @@ from r3jax.captures.faults.blocks import BlockImage, block_image, overlaps
 from r3jax.captures.faults.offsets import Offsets, Systematic, offsets
 from r3jax.captures.source import Source
 from r3jax.formats.errors import FormatError
+from r3jax.frame import read_ahead
 from r3jax.validation.files import printable
 
 BLURRED = 0.45
@@ -141,12 +142,12 @@ def find_faults(
     images: list[BlockImage] = []
     failed: dict[int, FormatError] = {}
     without_depth: list[int] = []
-    for index in chosen.tolist():
-        try:
-            rgb, depth = source.read(index)
-        except FormatError as error:
-            failed[index] = error
+    indices = chosen.tolist()
+    for index, picture in zip(indices, read_ahead(map(source.try_read, indices)), strict=True):
+        if isinstance(picture, FormatError):
+            failed[index] = picture
         else:
+            rgb, depth = picture
             images.append(block_image(rgb, depth, source.camera(index), source.poses[index]))
             if not (depth > 0.0).any():
                 without_depth.append(index)
