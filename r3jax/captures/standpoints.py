@@ -21,7 +21,8 @@ from scipy import ndimage
 from scipy.spatial import Delaunay, KDTree
 
 from r3jax.captures.ground import ground_of, is_free_at
-from r3jax.captures.survey import MARGIN
+from r3jax.captures.neighborhoods import divided
+from r3jax.captures.survey import MARGIN, RANGE
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.mapping.occupancy import OccupancyGrid, centers_on_host
 from r3jax.mapping.state import MapState
@@ -109,7 +110,8 @@ def places_of(
         meter: length of a meter [audit units]; None if the capture's unit is not known.
         center: center of an object that the cameras surround; None if there is none.
         with_cameras: True to have the cameras' own positions among the places, but for a dome.
-        num_standpoints: maximum number of standpoints.
+        num_standpoints: maximum number of standpoints in a place of up to 20 m; larger places have
+            more, by the number of their neighborhoods.
 
     Returns:
         Places in known free space; if there are few, also the cameras' own positions.
@@ -146,13 +148,19 @@ def places_of(
 def _standpoints(standing: np.ndarray, cameras: np.ndarray, reach: float, num: int) -> np.ndarray:
     """Spreads standpoints over the places [c, 3] within reach of a camera [n, 3], if there are any.
 
+    In a building they are as dense as in a house: 24 in 256 rooms would judge a tenth of them.
+
     Returns:
-        [q, 3], 1 <= q <= num.
+        [q, 3], q >= 1.
     """
+    num *= max(1, round(len(divided(cameras, RANGE)) / _CUBES))
     near = standing[np.asarray(KDTree(cameras).query(standing)[0]) <= reach]
     chosen = near if len(near) else standing
     return chosen[spread(chosen, num)]
 
+
+_CUBES = 16
+"""Neighborhoods in a place of 20 m."""
 
 _INWARD = 0.85
 """Minimum share of the cameras that look at the center of an object."""

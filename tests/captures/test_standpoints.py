@@ -3,9 +3,11 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from r3jax.captures import standpoints
 from r3jax.captures.standpoints import (
     inward_center,
     places_in_free_space,
@@ -116,3 +118,16 @@ def test_cameras_round_an_object_are_told_from_cameras_in_a_room(middle, height,
     assert inward_center(outward, middle + 5 * ring) is None
     # Walls all round, seen across the room, are no object.
     assert inward_center(round_it, middle + 2.5 * rng.normal(size=(60, 3))) is None
+
+
+@pytest.mark.parametrize(("edge", "num"), [(15.0, 8), (80.0, 128)])
+def test_a_building_has_as_many_standpoints_on_its_floor_as_a_house(edge, num):
+    """A camera every 2.5 m: 256 cubes of the range in 80 m, so sixteen houses."""
+    steps = np.arange(0.6, edge, 2.5)
+    x, y = np.meshgrid(steps, steps)
+    cameras = np.stack([x.ravel(), y.ravel(), np.full(x.size, 1.5)], axis=1)
+    found = standpoints._standpoints(cameras, cameras, 1.0, 8)
+    assert len(found) == num
+    # No camera is far from all of them.
+    apart = np.linalg.norm(cameras[:, None] - found[None], axis=2).min(axis=1)
+    assert apart.max() < 10.0

@@ -40,7 +40,7 @@ from r3jax.captures.capture_maps import (
     window_of,
 )
 from r3jax.captures.faults.faults import Faults, find_faults, stray_finding
-from r3jax.captures.neighborhoods import Neighborhood, divided, neighborhoods
+from r3jax.captures.neighborhoods import Neighborhood, neighborhoods
 from r3jax.captures.source import Source, thinned
 from r3jax.captures.standpoints import Places, inward_center, places_of
 from r3jax.captures.surfaces import with_surfaces
@@ -230,7 +230,7 @@ def audit(
         meter=survey.alignment.scale if source.is_metric else None,
         center=center,
         with_cameras=True,
-        num_standpoints=_num_standpoints(settings, cameras),
+        num_standpoints=settings.num_standpoints,
     )
     on_progress("evaluating frames", len(survey.chosen if path is None else path.poses))
     if path is None:
@@ -269,16 +269,6 @@ def audit(
         plan=plan,
         faults=faults,
     )
-
-
-def _num_standpoints(settings: AuditSettings, cameras: np.ndarray) -> int:
-    """Chooses the number of standpoints: in a building as many on the same floor as in a flat."""
-    return settings.num_standpoints * max(1, round(len(divided(cameras, RANGE)) / _CUBES))
-
-
-_CUBES = 16
-"""Cubes of a range's edge in the largest place for which `AuditSettings.num_standpoints` suffice: a
-house of 20 m."""
 
 
 def _survey(
