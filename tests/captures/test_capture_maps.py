@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from r3jax.captures import capture_maps as real
+from r3jax.captures import neighborhoods
 from r3jax.captures.capture_maps import Seen, integrate_rays, see
 from r3jax.captures.settings import SurveySettings
 from r3jax.captures.source import Source, source_of
@@ -175,6 +176,32 @@ def test_a_place_of_too_many_voxels_is_mapped_in_larger_ones_unless_they_are_giv
         assert larger == pytest.approx(size * max(1.5, (NUM / images) ** 0.5))
     with pytest.raises(ValueError, match="larger --voxel-size"):
         real.in_fitting_voxels(survey, SurveySettings(voxel_size=survey.voxel_size), mapped)
+
+
+def test_neighborhoods_give_the_folds_and_marks_of_one_map(monkeypatch):
+    source, survey = room()
+    split = lambda eyes, max_range: [np.arange(len(eyes))[i::3] for i in range(3)]
+    monkeypatch.setattr(real, "divided", split)
+    monkeypatch.setattr(neighborhoods, "divided", split)
+    found, whole = see(source, survey, folds=4), seen()
+    np.testing.assert_array_equal(found.fold_of, whole.fold_of)
+    np.testing.assert_allclose(found.grid.log_odds, whole.grid.log_odds, atol=1e-5)
+    pairs = [(found.state, whole.state), *zip(found.folds, whole.folds, strict=True)]
+    for a, b in pairs:
+        assert_same(a, b)
+        first, second = marks(a), marks(b)
+        assert first.keys() == second.keys()
+        for key, (words, resolution) in first.items():
+            assert words == second[key][0]
+            assert resolution == pytest.approx(second[key][1], rel=1e-5)
+
+
+def marks(state: MapState) -> dict[tuple[int, int], tuple]:
+    """From where each voxel was seen, and how sharply."""
+    rows = np.flatnonzero(np.asarray(state.visited).any(axis=0))
+    key, visited = (np.asarray(x)[:, rows].T.tolist() for x in (state.key, state.visited))
+    sharp = np.asarray(state.resolution)[rows].tolist()
+    return {tuple(k): v for k, *v in zip(key, visited, sharp, strict=True)}
 
 
 def test_more_folds_than_pictures_leave_one_each():
