@@ -17,6 +17,7 @@ from r3jax.formats.ros.bag_reader import read_bag
 from r3jax.formats.ros.bags import Topics, parse_topics
 from r3jax.formats.ros.messages import depth_of, is_color, lens_of, rgb_of
 from r3jax.formats.ros.transforms import TransformTree
+from r3jax.frame import read_ahead
 from r3jax.validation.errors import ForeignFileError
 from tests.formats.bags import (
     COLOR,
@@ -61,6 +62,16 @@ def test_a_bag_shows_the_room(tmp_path, kind):
     np.testing.assert_array_equal(images.up, [0, 0, 1])
     assert source_of(images, "drive").labels[0] == "1700000000.000000000"
     assert (images.depth(0)[:FACTOR, :FACTOR] == 0).all()
+
+
+@pytest.mark.parametrize("kind", ["mcap", "db3", "bag"])
+def test_a_bag_is_read_in_another_thread_as_well(tmp_path, kind):
+    """Audits and selections read ahead."""
+    images = open_capture(write_bag(path_of(tmp_path, kind), kind=kind)).source
+    assert isinstance(images, PosedImages)
+    depths = list(read_ahead(map(images.depth, range(NUM))))
+    for number, depth in enumerate(depths):
+        np.testing.assert_array_equal(depth, images.depth(number))
 
 
 @pytest.mark.parametrize(
