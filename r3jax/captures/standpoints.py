@@ -148,19 +148,28 @@ def places_of(
 def _standpoints(standing: np.ndarray, cameras: np.ndarray, reach: float, num: int) -> np.ndarray:
     """Spreads standpoints over the places [c, 3] within reach of a camera [n, 3], if there are any.
 
-    In a building they are as dense as in a house: 24 in 256 rooms would judge a tenth of them.
-
     Returns:
         [q, 3], q >= 1.
     """
-    num *= max(1, round(len(divided(cameras, RANGE)) / _CUBES))
     near = standing[np.asarray(KDTree(cameras).query(standing)[0]) <= reach]
     chosen = near if len(near) else standing
-    return chosen[spread(chosen, num)]
+    return chosen[spread(chosen, as_dense(num, cameras))]
+
+
+def as_dense(num: int, cameras: np.ndarray) -> int:
+    """Returns a number of places for a house of 20 m, or proportionally more for a larger place.
+
+    In 256 rooms, 24 places would judge a tenth of them.
+
+    Args:
+        num: the number for a house.
+        cameras: camera positions, [n, 3] [audit units].
+    """
+    return num * max(1, round(len(divided(cameras, RANGE)) / _CUBES))
 
 
 _CUBES = 16
-"""Neighborhoods in a place of 20 m."""
+"""Neighborhoods in a house of 20 m."""
 
 _INWARD = 0.85
 """Minimum share of the cameras that look at the center of an object."""

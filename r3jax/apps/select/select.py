@@ -35,7 +35,7 @@ from r3jax.captures.capture_maps import (
 from r3jax.captures.faults.blocks import BlockImage, block_image
 from r3jax.captures.neighborhoods import divided
 from r3jax.captures.source import Picture, Source, thinned
-from r3jax.captures.standpoints import places_of
+from r3jax.captures.standpoints import as_dense, places_of
 from r3jax.captures.surfaces import with_surfaces
 from r3jax.captures.survey import RANGE, Survey, survey_of
 from r3jax.errors import InputError
@@ -46,7 +46,7 @@ from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import poses_along
 
 STANDPOINTS, _DIRECTIONS = 24, 8
-"""Number of places with target views, and of level directions at each."""
+"""Number of places with target views in a house, and of level directions at each."""
 
 _OUTSIDE = 0.05
 """Minimum share of a target's pixels that show the map; below it the target is outside of the
@@ -293,7 +293,12 @@ def _targets(
         stood = survey.alignment.points(source.poses[used, :3, 3])
         meter = survey.alignment.scale if source.is_metric else None
         places = places_of(
-            whole, grid, stood, STANDPOINTS, is_dense=source.is_dense, meter=meter
+            whole,
+            grid,
+            stood,
+            as_dense(STANDPOINTS, stood),
+            is_dense=source.is_dense,
+            meter=meter,
         ).standing
         angles = 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
         level = np.stack([np.cos(angles), np.sin(angles), np.zeros(_DIRECTIONS)], axis=1)
