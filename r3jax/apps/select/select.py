@@ -436,7 +436,7 @@ def select_frames(
     not matter.
 
     Args:
-        frames: posed images with depth; read twice, one by one.
+        frames: posed images with depth; read three times, one by one.
         num: number of frames to choose.
         share: number of frames as a share of all frames.
         gain: choose enough frames to reach this share of the renderability with all frames. The
