@@ -179,11 +179,11 @@ def test_a_place_of_too_many_voxels_is_mapped_in_larger_ones_unless_they_are_giv
 
 
 def test_neighborhoods_give_the_folds_and_marks_of_one_map(monkeypatch):
-    source, survey = room()
+    (source, survey), whole = room(), seen()  # made before, or it would be cached as divided
     split = lambda eyes, max_range: [np.arange(len(eyes))[i::3] for i in range(3)]
     monkeypatch.setattr(real, "divided", split)
     monkeypatch.setattr(neighborhoods, "divided", split)
-    found, whole = see(source, survey, folds=4), seen()
+    found = see(source, survey, folds=4)
     np.testing.assert_array_equal(found.fold_of, whole.fold_of)
     np.testing.assert_allclose(found.grid.log_odds, whole.grid.log_odds, atol=1e-5)
     pairs = [(found.state, whole.state), *zip(found.folds, whole.folds, strict=True)]
