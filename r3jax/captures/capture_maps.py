@@ -149,7 +149,7 @@ def see(source: Source, survey: Survey, folds: int, on_frame: OnFrame = lambda: 
     count = min(folds, len(survey.chosen))
     parts = [blank(whole) for _ in range(count)]
     fold_of = np.arange(len(survey.chosen)) % count
-    order = np.concatenate(divided(_eyes(source, survey), RANGE))
+    order = np.concatenate(divided(eyes_of(source, survey), RANGE))
     numbers = survey.chosen[order].tolist()
     frames = read_ahead(source.frame(index, survey.alignment) for index in numbers)
     for near in neighborhoods_of(whole, source, survey, for_lookups=True):
@@ -166,10 +166,11 @@ def neighborhoods_of(
 ) -> Iterator[Neighborhood]:
     """Yields the neighborhoods of the images used, numbered in the order of `Survey.chosen`."""
     cameras = map(source.camera, survey.chosen.tolist())
-    return neighborhoods(whole, _eyes(source, survey), cameras, RANGE, for_lookups=for_lookups)
+    return neighborhoods(whole, eyes_of(source, survey), cameras, RANGE, for_lookups=for_lookups)
 
 
-def _eyes(source: Source, survey: Survey) -> np.ndarray:
+def eyes_of(source: Source, survey: Survey) -> np.ndarray:
+    """Returns the camera centers of the images used, [n, 3] [audit units]."""
     return survey.alignment.points(source.poses[survey.chosen, :3, 3])
 
 
@@ -199,7 +200,7 @@ def map_of_images(
         FormatError, RunError: a file is missing or broken.
         ValueError: there are more voxels than with any reasonable voxel size.
     """
-    groups = divided(_eyes(source, survey), RANGE)
+    groups = divided(eyes_of(source, survey), RANGE)
 
     def frames() -> Iterator[Frame]:
         numbers = survey.chosen[np.concatenate(groups)].tolist()
@@ -293,7 +294,7 @@ def cut_grid(grid: OccupancyGrid, start: Int[Array, " 3"], size: Window) -> Occu
 
 def _with_cameras(grid: OccupancyGrid, source: Source, survey: Survey) -> OccupancyGrid:
     """Marks the cameras' positions as free, regardless of the sensor, which is unreliable there."""
-    return free_round(grid, survey.alignment.points(source.poses[survey.chosen, :3, 3]))
+    return free_round(grid, eyes_of(source, survey))
 
 
 _MOST_RAYS = 1000

@@ -26,7 +26,8 @@ from r3jax.mapping.tiles import longest_ray, table_from
 from r3jax.mapping.update import MAX_LOAD
 
 _TOGETHER = 4.0
-"""Cameras within a box of so many ranges are one neighborhood; else a cube's edge is one range."""
+"""Cameras that fit into a box with edges of this many ranges are one neighborhood. All others are
+divided into cubes with edges of one range."""
 
 
 def divided(eyes: np.ndarray, max_range: float) -> list[np.ndarray]:
@@ -72,11 +73,6 @@ class Neighborhood:
             return part
         into, new = ({name: getattr(x, name) for name in _FIELDS} for x in (state, part))
         return replace(state, **_put(into, new, self.row), dropped=part.dropped)
-
-    def values_of(self, values: np.ndarray) -> np.ndarray:
-        """Takes the table's rows from values of the whole map's rows, [N]; 0 in empty rows, [M]."""
-        valid = self.row < len(values)
-        return np.where(valid, values[np.where(valid, self.row, 0)], np.zeros((), values.dtype))
 
 
 _FIELDS = ("visited", "count", "mean", "m2", "resolution")

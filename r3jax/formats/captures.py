@@ -164,8 +164,8 @@ def _with_model_beside(
     error: FormatError, path: Path, read: Callable[[Path], PosedImages]
 ) -> FormatError:
     """Names the COLMAP model of a folder whose transforms.json cannot be read, if it has one."""
-    model = find_model(path)
-    if read is not read_transforms or model is None:
+    model = find_model(path) if read is read_transforms else None
+    if model is None:
         return error
     return FormatError(error.path, f"{error.reason}; its COLMAP model may be whole: give {model}")
 

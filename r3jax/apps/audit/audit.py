@@ -33,6 +33,7 @@ from r3jax.captures.capture_maps import (
     OnFrame,
     Seen,
     cut_grid,
+    eyes_of,
     in_fitting_voxels,
     neighborhoods_of,
     see,
@@ -218,7 +219,7 @@ def audit(
     config = ScoringConfig(lambda1=unit, max_range=RANGE)
     lens = Counter(source.lenses).most_common(1)[0][0]
     camera = thinned(lens.camera, source.stride)
-    cameras = survey.alignment.points(source.poses[survey.chosen, :3, 3])
+    cameras = eyes_of(source, survey)
     surfaces = np.asarray(seen.state.center, np.float64).T[np.asarray(seen.state.present)]
     center = inward_center(survey.alignment.poses(source.poses[survey.chosen]), surfaces)
     places = places_of(
@@ -312,7 +313,7 @@ def _evaluated_path(
     found: dict[int, EvaluatedFrame] = {}
     every = np.arange(len(survey.chosen))
     for near in neighborhoods(seen.state, poses[:, :3, 3], cameras, RANGE, for_lookups=False):
-        shown = _pictures(source, survey, seen, near, every)
+        shown = _pictures(source, survey, near, every)
         for index in near.numbers.tolist():
             score = view_score(near.state, cameras[index], poses[index], config, shown)
             found[index] = EvaluatedFrame(index, f"frame {index + 1}", poses[index], score)
@@ -330,7 +331,7 @@ def _evaluated_frames(
         parts = [near.part_of(part) for part in seen.folds]
         for fold in np.unique(seen.fold_of[near.numbers]).tolist():
             others = united([part for i, part in enumerate(parts) if i != fold])
-            shown = _pictures(source, survey, seen, near, np.flatnonzero(seen.fold_of != fold))
+            shown = _pictures(source, survey, near, np.flatnonzero(seen.fold_of != fold))
             for place in near.numbers[seen.fold_of[near.numbers] == fold].tolist():
                 index = int(survey.chosen[place])
                 depth = None if shown is None else survey.alignment.scale * source.read(index)[1]
@@ -342,12 +343,12 @@ def _evaluated_frames(
 
 
 def _pictures(
-    source: Source, survey: Survey, seen: Seen, near: Neighborhood, numbers: np.ndarray
+    source: Source, survey: Survey, near: Neighborhood, numbers: np.ndarray
 ) -> Pictures | None:
     """Lists some pictures of a map in which surfaces may be unknown; None if all are known."""
     if source.is_complete:
         return None
-    known = near.values_of(known_rows(seen.state, is_complete=False))
+    known = known_rows(near.state, is_complete=False)
     chosen = survey.chosen[numbers]
     poses = survey.alignment.poses(source.poses[chosen])
     return Pictures(known, [source.camera(index) for index in chosen.tolist()], poses)
@@ -356,14 +357,13 @@ def _pictures(
 def _blank_regions(
     source: Source, survey: Survey, seen: Seen, config: ScoringConfig
 ) -> tuple[Region, ...]:
-    known = known_rows(seen.state, is_complete=False)
     poses = survey.alignment.poses(source.poses[survey.chosen])
     points: dict[int, np.ndarray] = {}
     for near in neighborhoods_of(seen.state, source, survey, for_lookups=False):
-        own = near.values_of(known)
+        known = known_rows(near.state, is_complete=False)
         for i in near.numbers.tolist():
             camera = source.camera(int(survey.chosen[i]))
-            points[i] = blank_points(near.state, own, camera, poses[i], config)
+            points[i] = blank_points(near.state, known, camera, poses[i], config)
     return tuple(blank_regions(seen.state, list(points.values())))
 
 

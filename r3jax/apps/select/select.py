@@ -26,6 +26,7 @@ from r3jax.apps.select.targets import Targets, see_targets
 from r3jax.captures.camera_paths import path_of
 from r3jax.captures.capture_maps import (
     OnFrame,
+    eyes_of,
     in_fitting_voxels,
     join_frame,
     join_on_rows,
@@ -190,7 +191,7 @@ def _surfaces(source: Source, survey: Survey, on_frame: OnFrame) -> _Surfaces:
     """Maps all frames; also returns their block images, their fineness, and unreadable frames."""
     images: dict[int, tuple[BlockImage, float]] = {}
     unread: dict[int, FormatError] = {}
-    groups = divided(survey.alignment.points(source.poses[survey.chosen, :3, 3]), RANGE)
+    groups = divided(eyes_of(source, survey), RANGE)
     order = np.concatenate(groups).tolist()
 
     def read(number: int) -> tuple[Picture, Frame] | FormatError:
