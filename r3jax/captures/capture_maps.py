@@ -34,10 +34,10 @@ from r3jax.captures.survey import LARGEST_VOXEL, MARGIN, RANGE, Survey
 from r3jax.errors import InputError
 from r3jax.frame import Frame, read_ahead
 from r3jax.kernels import calls
+from r3jax.kernels.constants import LOG_ODDS_LIMIT
 from r3jax.kernels.native.platform import by_platform
 from r3jax.mapping.join import combine_moments
 from r3jax.mapping.occupancy import (
-    LOG_ODDS_LIMIT,
     VOUCHED_LOG_ODDS,
     OccupancyGrid,
     empty_grid,
@@ -54,6 +54,9 @@ _MOST_ROWS = 1 << 22
 
 _SPARSE_REACH = 1.1
 """Without depth images, an image sees this many times as far as its farthest point."""
+
+
+_integrate_depth = jax.jit(integrate_depth)
 
 
 class TooManyVoxelsError(InputError):
@@ -261,18 +264,8 @@ def map_grid(source: Source, survey: Survey, numbers: np.ndarray) -> OccupancyGr
 
 def _update_grid(grid: OccupancyGrid, source: Source, frame: Frame) -> OccupancyGrid:
     if source.is_dense:
-        start, size = window_of(grid, np.asarray(frame.position))
-        return _integrate_depth(grid, frame, start, size)
+        return _integrate_depth(grid, frame, RANGE)
     return integrate_rays(grid, np.asarray(frame.position), _measured_points(frame))
-
-
-@partial(jax.jit, static_argnames="size")
-def _integrate_depth(
-    grid: OccupancyGrid, frame: Frame, start: Int[Array, " 3"], size: Window
-) -> OccupancyGrid:
-    near = integrate_depth(cut_grid(grid, start, size), frame, jnp.float32(RANGE))
-    log_odds = jax.lax.dynamic_update_slice(grid.log_odds, near.log_odds, start)
-    return eqx.tree_at(lambda g: g.log_odds, grid, log_odds)
 
 
 def window_of(grid: OccupancyGrid, eye: np.ndarray) -> tuple[np.ndarray, Window]:

@@ -282,19 +282,16 @@ def _look(
     frame = _render(mission, state.views, T_world_camera)
     # Read here: what follows is bookkeeping, not time of the simulator.
     stages = stages | {"render": time.perf_counter() - begin}
-    # On the map before the frame, for which the view was chosen.
-    before_frame = at_hand(state.planner, np.asarray(frame.T_world_camera)[:3, 3]).map_state
-    arrival = view_renderability(before_frame, frame.camera, frame.T_world_camera)
-
     mission.on_stage("map")
+    measures = mission.clock.measures
+    position = np.asarray(frame.T_world_camera)[:3, 3]
+    planner, moving = timed(at_hand, state.planner, position, repeat_compiled=measures)
+    # On the map before the frame, for which the view was chosen.
+    arrival = view_renderability(planner.map_state, frame.camera, frame.T_world_camera)
     planner, measured = timed(
-        observe_view,
-        state.planner,
-        frame,
-        mission.rules,
-        captured=captured,
-        repeat_compiled=mission.clock.measures,
+        observe_view, planner, frame, mission.rules, captured=captured, repeat_compiled=measures
     )
+    measured += moving
     mapping = mission.clock.charge("mapping", measured)
     length, flight = (0.0, 0.0) if leg is None else (leg.length, leg.flight)
     charged = before | {"mapping": mapping, "flight": flight}

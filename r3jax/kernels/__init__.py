@@ -8,6 +8,7 @@ compiled. A test compares each with its formula.
 | `map_add` | `mapping.update.integrate_pixels` | `mapping/test_kernels.py` |
 | `map_mark` | `mapping.seen.rows_in_view`, `mark_rows` | `mapping/test_kernels.py` |
 | `map_miss` | `mapping.moved.count_misses` | `mapping/test_moved.py` |
+| `grid_depth` | `mapping.occupancy.integrate_depth` | `mapping/test_occupancy.py` |
 | `sums` | `scoring.formulas.sums_in_view` | `scoring/test_backends.py` |
 | `changes` | `scoring.formulas.change_of_sums` | `scoring/test_backends.py` |
 | `pixels` | `scoring.formulas.rows_in_pixels` | `scoring/test_backends.py` |

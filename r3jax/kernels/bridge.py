@@ -11,6 +11,7 @@ from r3jax.kernels.adam import adam_pass
 from r3jax.kernels.calls import Cells, FrameArrays, Layout, MapRows, Views
 from r3jax.kernels.image_loss import loss_pass
 from r3jax.kernels.mapping.add import map_add
+from r3jax.kernels.mapping.cells import grid_depth
 from r3jax.kernels.mapping.mark import map_mark, map_miss
 from r3jax.kernels.native.compiled import inlined
 from r3jax.kernels.native.ffi import (
@@ -146,6 +147,19 @@ def _map_miss(frame):
         float0(frame, ARGUMENTS, 6),
         _image(frame, 7),
         np.int64(ints1(frame, ARGUMENTS, 18)[0]),
+    )
+    return 0
+
+
+def _grid_depth(frame):
+    """Arguments: log-odds, origin, cell size, frame (11)."""
+    if answers_metadata(frame):
+        return 0
+    grid_depth(
+        floats3(frame, RESULTS, 0),
+        floats1(frame, ARGUMENTS, 1),
+        float0(frame, ARGUMENTS, 2),
+        _image(frame, 3),
     )
     return 0
 
@@ -347,6 +361,7 @@ HANDLERS = {
     "sums": _sums,
     "map_mark": _map_mark,
     "map_add": _map_add,
+    "grid_depth": _grid_depth,
     "map_miss": _map_miss,
     "pixels": _pixels,
     "changes": _changes,

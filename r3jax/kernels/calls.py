@@ -279,6 +279,22 @@ def map_miss(
     return rows._replace(counts=counts, m2=m2), mean, misses
 
 
+def grid_depth(
+    log_odds: Float[Array, "X Y Z"],
+    origin: Float[Array, " 3"],
+    cell_size: Float[Array, ""],
+    frame: FrameArrays,
+) -> Float[Array, "X Y Z"]:
+    """Updates a grid with a depth image, in place: `mapping.occupancy.integrate_depth`."""
+    return _call(
+        "grid_depth",
+        [_like(log_odds)],
+        (log_odds, origin, cell_size, frame),
+        input_output_aliases={0: 0},
+        vmap_method="sequential",
+    )[0]
+
+
 def sums(
     rows: MapRows, cells: Cells, views: Views, layout: Layout, forms: Forms,
     num_bins: int, voxel_bins: int, *, keep: bool = False,

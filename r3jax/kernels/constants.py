@@ -132,3 +132,18 @@ LEAST_DEVIATION = 0.008
 
 NO_SCORE = -1.0
 """Score of a comparison that cannot be made."""
+
+LOG_ODDS_LIMIT = 4.5
+"""Log-odds of the grid's cells are clipped to +- this, so that cells can change their state."""
+
+STEP = 2.8
+"""Log-odds step of an observation from distance 0."""
+
+STEP_DECAY = 0.1
+"""Decrease of the step per meter [1/m]."""
+
+BLOCKS_ACROSS = 64
+"""Blocks per image row: 8 pixels of a 512-pixel row, 9 cm at 5 m with 60 degrees of view."""
+
+PASSED_OCTANTS = 4
+"""A cell is passed if so many of its eight octants' centers were seen through."""

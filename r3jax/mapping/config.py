@@ -1,7 +1,9 @@
 """Settings of the map and the grid. Plain numbers: they go into run.json as they are."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
 
 from r3jax.errors import InputError
 
@@ -70,3 +72,13 @@ class MappingConfig:
             raise InputError(f"capacity must be a power of two >= 2, got {self.capacity}")
         if self.capacity > MAX_CAPACITY:
             raise InputError(f"capacity must be at most {MAX_CAPACITY}, got {self.capacity}")
+
+
+def mapping_config_of(settings: Mapping[str, Any]) -> MappingConfig:
+    """Reads what concerns the map out of stored settings, which may be those of an exploration.
+
+    Raises:
+        TypeError, ValueError: a setting that cannot be used.
+    """
+    known = {field.name for field in fields(MappingConfig)}
+    return MappingConfig(**{name: x for name, x in settings.items() if name in known})

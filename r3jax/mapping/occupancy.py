@@ -23,6 +23,7 @@ Shape symbols: X Y Z cells along the axes; H W image size; h w blocks; n points.
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -35,7 +36,17 @@ from r3jax.frame import Frame, a_frame
 from r3jax.geometry.arguments import checked, one
 from r3jax.geometry.cameras import Camera, invert_pose, nan_unless_valid, pixel_rays
 from r3jax.geometry.voxels import check_near_origin
+from r3jax.kernels import calls
 from r3jax.kernels.calls import Cells
+from r3jax.kernels.constants import (
+    BLOCKS_ACROSS,
+    LOG_ODDS_LIMIT,
+    PASSED_OCTANTS,
+    STEP,
+    STEP_DECAY,
+)
+from r3jax.kernels.native.platform import by_platform
+from r3jax.mapping.update import for_kernels
 
 FREE_LOG_ODDS = -1.3862944
 """A cell is free below this: p = 0.2."""
@@ -43,20 +54,8 @@ FREE_LOG_ODDS = -1.3862944
 OCCUPIED_LOG_ODDS = 1.3862944
 """A cell is occupied above this: p = 0.8."""
 
-LOG_ODDS_LIMIT = 4.5
-"""Log-odds are clipped to +- this, so that cells can change their state."""
-
-STEP = 2.8
-"""Log-odds step of an observation from distance 0."""
-
-STEP_DECAY = 0.1
-"""Decrease of the step per meter [1/m]."""
-
 VOUCHED_LOG_ODDS = -1.5
 """Log-odds set by `mark_free_ball`: free, but a single hit within range makes the cell occupied."""
-
-BLOCKS_ACROSS = 64
-"""Blocks per image row: 8 pixels of a 512-pixel row, 9 cm at 5 m with 60 degrees of view."""
 
 KEEP_OUT, COSTMAP, REFUSED, TRUSTED = 1, 2, 4, 8
 """Marks of cells: a keep-out zone, an obstacle of a costmap, a goal that was not reached, and free
@@ -284,7 +283,33 @@ def integrate_depth(
         TypeError: not a grid, or not a frame.
         ValueError: several at once, without `jax.vmap`.
     """
-    reach = jnp.asarray(max_range, dtype=jnp.float32)
+    log_odds = _updated(grid, frame, jnp.asarray(max_range, dtype=jnp.float32))
+    # Nothing can be raised under jit: NaN spreads to every later score.
+    cell_size = grid.cell_size * nan_unless_valid(frame.camera, frame.T_world_camera)
+    return eqx.tree_at(lambda g: (g.log_odds, g.cell_size), grid, (log_odds, cell_size))
+
+
+@jax.custom_jvp
+def _updated(grid: OccupancyGrid, frame: Frame, reach: Float[Array, ""]) -> Float[Array, "X Y Z"]:
+    """Computes the log-odds after a frame, by a kernel on CPUs and by the formulas elsewhere."""
+    return by_platform(cpu=_by_kernel, default=_by_formulas)(grid, frame, reach)
+
+
+@_updated.defjvp
+def _updated_jvp(primals: Any, tangents: Any) -> Any:
+    return jax.jvp(_by_formulas, primals, tangents)
+
+
+def _by_kernel(grid: OccupancyGrid, frame: Frame, reach: Float[Array, ""]) -> Float[Array, "X Y Z"]:
+    # An invalid pose makes the range NaN: nothing is in range.
+    reach = reach * nan_unless_valid(frame.camera, frame.T_world_camera)
+    image = for_kernels(frame, reach, jnp.asarray(False))
+    return calls.grid_depth(grid.log_odds, grid.origin, grid.cell_size, image)
+
+
+def _by_formulas(
+    grid: OccupancyGrid, frame: Frame, reach: Float[Array, ""]
+) -> Float[Array, "X Y Z"]:
     hit = _hit_cells(grid, frame, reach)
     # A point in a cell outweighs any number of rays through it: matter may be thin.
     passed = _passed_cells(grid, frame, reach) & ~hit
@@ -293,10 +318,7 @@ def integrate_depth(
     # Distant observations count less; beyond 10 m they would count nothing.
     step = STEP * jnp.clip(1.0 - STEP_DECAY * distance, 0.0, 1.0)
     change = jnp.where(hit, step, jnp.where(passed, -step, 0.0))
-    log_odds = jnp.clip(grid.log_odds + change, -LOG_ODDS_LIMIT, LOG_ODDS_LIMIT)
-    # Nothing can be raised under jit: NaN spreads to every later score.
-    cell_size = grid.cell_size * nan_unless_valid(frame.camera, frame.T_world_camera)
-    return eqx.tree_at(lambda g: (g.log_odds, g.cell_size), grid, (log_odds, cell_size))
+    return jnp.clip(grid.log_odds + change, -LOG_ODDS_LIMIT, LOG_ODDS_LIMIT)
 
 
 def integrate_rays(
@@ -404,7 +426,7 @@ def _passed_cells(
         wall = nearest.reshape(-1)[row * num_columns + column]
         is_before = z + 0.25 * grid.cell_size <= wall
         count = count + (in_view & in_range & is_before).astype(jnp.int32)
-    return count >= len(_OCTANTS) // 2
+    return count >= PASSED_OCTANTS
 
 
 def _nearest_by_block(

@@ -27,10 +27,9 @@ import numpy as np
 from r3jax.errors import InputError
 from r3jax.geometry.cameras import Camera
 from r3jax.geometry.voxels import EMPTY_WORD, INDEX_LIMIT, check_near_origin
-from r3jax.kernels.constants import JOINED, MAX_PROBES
+from r3jax.kernels.constants import JOINED, LOG_ODDS_LIMIT, MAX_PROBES
 from r3jax.mapping.config import MappingConfig
 from r3jax.mapping.join import merge
-from r3jax.mapping.occupancy import LOG_ODDS_LIMIT
 from r3jax.mapping.state import MapState
 from r3jax.mapping.table import hash_on_host
 from r3jax.mapping.tile_files import Filed, Rows, Tile, TileFolder, Voxels

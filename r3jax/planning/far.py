@@ -14,6 +14,7 @@ Shape symbols: n cells; m columns; v views; X Y Z cells at hand.
 
 import functools
 from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -69,6 +70,10 @@ from r3jax.planning.far_paths import (
 )
 from r3jax.planning.policy import Decision, LivesOutside, Policy
 from r3jax.planning.robot.limits import Limits, angles_along, rotations
+
+_ASIDE = ThreadPoolExecutor(1, thread_name_prefix="tiles")
+"""The thread that scores what blocks leave behind, one block after the other: each one may wait for
+the one before."""
 
 _BLOCK = 1.0
 """Of views so close together [m] the best is kept."""
@@ -165,6 +170,18 @@ class Far:
 
     tried: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     """Far goals at which the robot has arrived, [k, 3] [m]."""
+
+    left: "Future[tuple[Coarse, Views]] | None" = None
+    """What the block has left behind, while it is still computed: takes the place of `coarse` and
+    `views` in `settled`."""
+
+    @property
+    def settled(self) -> "Far":
+        """The same, when all that the block has left behind is computed."""
+        if self.left is None:
+            return self
+        coarse, views = self.left.result()
+        return replace(self, coarse=coarse, views=views, left=None)
 
     @property
     def first_cell(self) -> np.ndarray:
@@ -349,12 +366,21 @@ def moved_to(known: Known, policy: GreedyPolicy, position: np.ndarray) -> Known:
     map_state, grid, memory, far = known
     if middle_for(far.tiles, position) == far.tiles.middle:
         return known
-    far = with_coarse(far, grid, memory, policy.config)
     after, layers, tiles = page(map_state, layers_of(grid, memory), far.tiles, position)
-    # Before they are out of hand: what they promise stays true until the robot comes back.
-    views = _renewed((map_state, grid, memory, far), policy, tiles.middle, position)
-    far = replace(far, tiles=tiles, views=views)
+    # Takes seconds in a large block, and no frame needs it: the next decision may wait for it.
+    left = _ASIDE.submit(_left_behind, known, policy, tiles.middle, position)
+    far = replace(far, tiles=tiles, left=left)
     return after, far.grid(layers["log_odds"]), with_layers(memory, layers, far), far
+
+
+def _left_behind(
+    known: Known, policy: GreedyPolicy, middle: Tile, position: np.ndarray
+) -> tuple[Coarse, Views]:
+    """Computes the coarse level and the views that a block leaves behind; arguments: `_renewed`."""
+    map_state, grid, memory, far = known
+    far = with_coarse(far.settled, grid, memory, policy.config)
+    # Before they are out of hand: what they promise stays true until the robot comes back.
+    return far.coarse, _renewed((map_state, grid, memory, far), policy, middle, position)
 
 
 def layers_of(grid: OccupancyGrid, memory: PlannerState) -> Layers:
@@ -627,7 +653,7 @@ def arrived(far: Far, here: np.ndarray) -> Far:
 
 def with_columns(far: Far, columns: Mapping[int, np.ndarray]) -> Far:
     """Replaces the columns of some marks, and closes theirs on the coarse level."""
-    columns = {**far.columns, **columns}
+    far, columns = far.settled, {**far.columns, **columns}
     none = np.zeros((0, 2), np.int64)
     closed = np.concatenate([columns.get(mark, none) for mark in (KEEP_OUT, COSTMAP)])
     return replace(far, columns=columns, coarse=with_closed(far.coarse, closed))
@@ -635,6 +661,7 @@ def with_columns(far: Far, columns: Mapping[int, np.ndarray]) -> Far:
 
 def far_arrays(far: Far) -> dict[str, np.ndarray]:
     """Lists all that is known of far places as arrays, to be stored."""
+    far = far.settled
     arrays = {f"tiles.{name}": x for name, x in arrays_of(far.tiles).items()}
     arrays |= {"box": far.box, "border": np.array(far.border), "trails": far.trails,
                "refused": far.refused, "goal": far.goal, "tried": far.tried}  # fmt: skip
@@ -697,6 +724,7 @@ def merged_far(fars: Sequence[Far], tiles: Tiles) -> Far:
         fars: of planners with the same lattice.
         tiles: of all of them.
     """
+    fars = [far.settled for far in fars]
     first = fars[0]
     merged = replace(
         first,

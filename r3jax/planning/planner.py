@@ -255,7 +255,7 @@ def decide(
     after = replace(planner, policy_state=policy_state)
     if planner.far is None:
         return decision, after, info
-    if decision is not None and not planner.far.coarse.tiles:
+    if decision is not None and not planner.far.settled.coarse.tiles:
         # For its programs: the same score views when the block moves, which must not wait for them.
         known = planner.policy_state, planner.map_state, planner.grid, pose, decision
         cast(GreedyPolicy, planner.policy).reconsider(*known, key=key)
@@ -277,7 +277,7 @@ def _decide_far(
     # A policy that has viewed all frontier cells at hand starts over: first come those far away.
     starts_over = policy.memory_by_cell and bool(np.any(viewed & ~memory.memory))
     known = replace(memory, memory=viewed | memory.memory) if starts_over else memory
-    far = with_coarse(arrived(before.far, here), before.grid, known, policy.config)
+    far = with_coarse(arrived(before.far.settled, here), before.grid, known, policy.config)
     best, left = weigh_far(far, policy, None if starts_over else decision, pose)
     if decision is not None:
         left = with_views(left, decision, here, policy.config.radius)

@@ -59,7 +59,7 @@ def rebuild(
         tiles = replace(far.tiles, voxels=Voxels(), cells={})
         coarse = replace(far.coarse, tiles={}, links={})
         far = replace(far, tiles=tiles, coarse=coarse, trails=far.trails[:0], views=NO_VIEWS,
-                      goal=far.goal[:0], tried=far.tried[:0])  # fmt: skip
+                      left=None, goal=far.goal[:0], tried=far.tried[:0])  # fmt: skip
     grid = mark_starts(grid, starts, planner.config)
     config = replace(planner.config, capacity=planner.map_state.capacity)
     key = jax.random.key(0) if key is None else key

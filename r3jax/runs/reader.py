@@ -1,7 +1,7 @@
 """Reads a run folder: settings and rows immediately, images on demand."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ from r3jax.exploration.state import LoopState
 from r3jax.exploration.taken_views import StepRow, content_hash, from_integers
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
-from r3jax.mapping.config import MappingConfig
+from r3jax.mapping.config import mapping_config_of
 from r3jax.mapping.occupancy import OccupancyGrid
 from r3jax.mapping.state import MapState
 from r3jax.runs.header import RunError, RunHeader, read_header
@@ -100,10 +100,8 @@ class Run:
 
         Of a run with tiles the whole map, and the whole grid.
         """
-        config = self.header.config
-        known = {field.name for field in fields(MappingConfig)}
         try:
-            mapping = MappingConfig(**{k: v for k, v in config.items() if k in known})
+            mapping = mapping_config_of(self.header.config)
         except (TypeError, ValueError) as error:
             raise RunError(self.path / "run.json", f"a setting of the loop: {error}") from None
         return read_checkpoint(self.path / "checkpoints", mapping, self.camera)

@@ -22,7 +22,7 @@ from r3jax.checkpoints import discard, numbered, read_arrays, write_checkpoint
 from r3jax.errors import InputError, PathError
 from r3jax.geometry.arguments import checked
 from r3jax.geometry.cameras import Camera
-from r3jax.mapping.config import MappingConfig
+from r3jax.mapping.config import MappingConfig, mapping_config_of
 from r3jax.mapping.occupancy import OccupancyGrid, empty_grid
 from r3jax.mapping.state import empty_map
 from r3jax.mapping.tile_files import (
@@ -141,7 +141,7 @@ def load(
         )
     try:
         settings = unsealed(plain)
-        config = MappingConfig(**settings["mapping"])
+        config = mapping_config_of(settings["mapping"])
         camera = _camera_of(settings["camera"])
         policy = _policy_of(settings["policy"])
         arrays_at = folder / str(settings["arrays"])

@@ -8,12 +8,11 @@ from hypothesis import strategies as st
 
 from r3jax.apps.select.observations import observe
 from r3jax.apps.select.targets import see_targets
-from r3jax.captures import capture_maps, neighborhoods
+from r3jax.captures import neighborhoods
 from r3jax.captures.capture_maps import blank, join_on_rows, map_of_all
 from r3jax.captures.neighborhoods import divided
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
-from r3jax.mapping.occupancy import empty_grid, integrate_depth
 from r3jax.mapping.state import empty_map
 from r3jax.mapping.update import integrate_growing
 from tests.captures.test_capture_maps import assert_same
@@ -113,21 +112,3 @@ def test_rows_that_are_taken_and_put_back_change_nothing_else():
         np.testing.assert_array_equal(after.mean, np.where(is_near, whole.mean, 0.0))
         np.testing.assert_array_equal(np.append(whole.m2, np.float32(0.0))[near.row], part.m2)
     assert max(shares) < 0.9
-
-
-@given(seeds)
-@settings(max_examples=5)
-def test_free_space_within_a_window_is_that_of_the_whole_grid(seed):
-    """The range of an audit is 5: a grid of 30 x 30 cells of a meter has room round a window."""
-    frame = walk(seed, 1)[0]
-    rng = np.random.default_rng(seed)
-    T = frame.T_world_camera.at[:3, 3].set(jnp.asarray(rng.uniform(1.0, 29.0, 3), jnp.float32))
-    depth = 5.0 * frame.depth
-    frame = Frame(frame.rgb, depth, T, CAMERA)
-    grid = empty_grid(np.array([[0.0, 0.0, 0.0], [30.0, 30.0, 30.0]]), 1.0)
-    start, size = capture_maps.window_of(grid, np.asarray(frame.position))
-    assert max(size) < min(grid.log_odds.shape)
-    found = capture_maps._integrate_depth(grid, frame, start, size)
-    plain = integrate_depth(grid, frame, 5.0)
-    np.testing.assert_allclose(found.log_odds, plain.log_odds, atol=1e-5)
-    assert np.asarray(found.log_odds).any()

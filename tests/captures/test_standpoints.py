@@ -16,7 +16,8 @@ from r3jax.captures.standpoints import (
     places_on_dome,
 )
 from r3jax.captures.survey import MARGIN
-from r3jax.mapping.occupancy import LOG_ODDS_LIMIT, OccupancyGrid, empty_grid
+from r3jax.kernels.constants import LOG_ODDS_LIMIT
+from r3jax.mapping.occupancy import OccupancyGrid, empty_grid
 from r3jax.mapping.state import empty_map
 from tests.apps.audit.room import pose_at
 

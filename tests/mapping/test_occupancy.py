@@ -11,9 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera, look_at
+from r3jax.mapping import occupancy
 from r3jax.mapping.occupancy import (
     cell_centers,
     empty_grid,
@@ -325,3 +328,45 @@ def test_cells_and_their_centers_are_inverse(grid):
 def test_bad_bounds_are_named(bounds, cell_size, message):
     with pytest.raises(ValueError, match=message):
         empty_grid(np.array(bounds, float), cell_size)
+
+
+formulas = jax.jit(occupancy._by_formulas)
+kernel = jax.jit(occupancy._by_kernel)
+
+LENSES = (Camera(24, 40, 30.0, 34.0, 11.0, 20.5), Camera(130, 70, 60.0, 60.0, 65.0, 35.0))
+"""Narrow and upright with blocks of one pixel; wide with blocks of two that do not divide it."""
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    lens=st.sampled_from(LENSES),
+    reach=st.sampled_from([0.3, 2.0, 5.0, np.inf]),
+)
+@settings(max_examples=25)
+def test_the_kernel_updates_the_cells_that_the_formulas_update(seed, lens, reach):
+    random = np.random.default_rng(seed)
+    # Some cameras stand outside of the grid and look away from it.
+    low = random.uniform(-2.0, 1.0, 3)
+    grid = empty_grid(low + np.array([[0.0, 0.0, 0.0], [4.0, 3.0, 2.0]]), CELL)
+    before = random.uniform(-4.5, 4.5, grid.log_odds.shape).astype(np.float32)
+    grid = eqx.tree_at(lambda g: g.log_odds, grid, jnp.asarray(before))
+    depth = random.uniform(0.2, 3.0) + 0.3 * random.random((lens.height, lens.width))
+    depth[:, lens.width // 2 :] += random.uniform(0.0, 2.0)
+    depth[random.random(depth.shape) < 0.2] = 0.0
+    depth[random.random(depth.shape) < 0.1] = np.inf
+    eye, aim = random.normal(size=3), random.normal(size=3)
+    T = look_at(jnp.asarray(eye, jnp.float32), jnp.asarray(eye + aim, jnp.float32))
+    frame = Frame(jnp.zeros((*depth.shape, 3)), jnp.asarray(depth, jnp.float32), T, lens)
+    found, expected = (f(grid, frame, jnp.float32(reach)) for f in (kernel, formulas))
+    # Rounding may put a point or an octant on the other side of a cell's or a pixel's edge.
+    differ = ~np.isclose(found, expected, atol=1e-5)
+    assert differ.sum() <= 2 + 0.001 * (np.asarray(expected) != before).sum()
+
+
+def test_a_pose_that_is_not_rigid_changes_no_cell(grid):
+    frame = frame_at([1.0, 2.5, 1.3], [5.0, 2.5, 1.3])
+    # A frame refuses such a pose, but not what happens to it under jit.
+    skewed = eqx.tree_at(lambda f: f.T_world_camera, frame, 2.0 * frame.T_world_camera)
+    after = update(grid, skewed)
+    np.testing.assert_array_equal(after.log_odds, grid.log_odds)
+    assert np.isnan(float(after.cell_size))

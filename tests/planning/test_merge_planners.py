@@ -11,7 +11,7 @@ import pytest
 
 import r3jax
 from r3jax.errors import InputError
-from r3jax.mapping.occupancy import LOG_ODDS_LIMIT
+from r3jax.kernels.constants import LOG_ODDS_LIMIT
 from r3jax.planning.planner import at_hand
 from tests.mapping.test_tiles import assert_same_map, sorted_rows
 from tests.planning.test_far import CAMERA, CONFIG, a_policy

@@ -1,13 +1,16 @@
 """A planner that was saved goes on as if it had not been; damage is refused by name."""
 
 import json
+from dataclasses import fields, replace
 
 import jax
 import numpy as np
 import pytest
 
 import r3jax
+from r3jax.exploration.config import ExplorationConfig
 from r3jax.files import NotOursError
+from r3jax.mapping.config import MappingConfig
 from r3jax.planning.robot.motion import make_motion
 from r3jax.runs.header import RunError
 from r3jax.validation.json_text import sealed, unsealed
@@ -49,6 +52,16 @@ def test_it_decides_as_before(planner, tmp_path):
     assert (a is None) == (b is None), info
     if a is not None:
         np.testing.assert_array_equal(a.T_world_camera, b.T_world_camera)
+
+
+def test_the_planner_of_an_exploration_is_stored_without_its_loop(planner, tmp_path):
+    planner, pose = planner
+    of_a_loop = ExplorationConfig(capacity=planner.config.capacity, capture_every=0.5)
+    r3jax.save(replace(planner, config=of_a_loop), tmp_path)
+    again = r3jax.load(tmp_path)
+    stored = {field.name: getattr(of_a_loop, field.name) for field in fields(MappingConfig)}
+    assert again.config == MappingConfig(**stored)
+    assert r3jax.decide(again, pose, jax.random.key(5))[2].outcome
 
 
 def test_it_replaces_its_own_and_nothing_else(planner, tmp_path):
