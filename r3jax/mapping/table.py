@@ -10,7 +10,6 @@ Shape symbols: N capacity; n keys of a call.
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Int, UInt32
 
 from r3jax.geometry.voxels import EMPTY_WORD
@@ -34,19 +33,6 @@ def _mix(h: UInt32[Array, " n"]) -> UInt32[Array, " n"]:
     h = (h ^ (h >> 16)) * jnp.uint32(0x85EBCA6B)
     h = (h ^ (h >> 13)) * jnp.uint32(0xC2B2AE35)
     return h ^ (h >> 16)
-
-
-def hash_on_host(keys: UInt32[np.ndarray, "2 n"]) -> UInt32[np.ndarray, " n"]:
-    """Computes `hash_key` by NumPy: nothing compiles for another number of keys."""
-    with np.errstate(over="ignore"):
-        h = _mix_on_host(keys[0] ^ np.uint32(0x9E3779B9))
-        return _mix_on_host(h ^ (keys[1] * np.uint32(0x85EBCA6B)))
-
-
-def _mix_on_host(h: UInt32[np.ndarray, " n"]) -> UInt32[np.ndarray, " n"]:
-    h = (h ^ (h >> np.uint32(16))) * np.uint32(0x85EBCA6B)
-    h = (h ^ (h >> np.uint32(13))) * np.uint32(0xC2B2AE35)
-    return h ^ (h >> np.uint32(16))
 
 
 def _slot(hashed: UInt32[Array, " n"], probe: Int[Array, ""], capacity: int) -> Int[Array, " n"]:

@@ -17,6 +17,7 @@ import itertools
 import math
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -27,11 +28,11 @@ import numpy as np
 from r3jax.errors import InputError
 from r3jax.geometry.cameras import Camera
 from r3jax.geometry.voxels import EMPTY_WORD, INDEX_LIMIT, check_near_origin
-from r3jax.kernels.constants import JOINED, LOG_ODDS_LIMIT, MAX_PROBES
+from r3jax.kernels.constants import JOINED, LOG_ODDS_LIMIT
+from r3jax.kernels.mapping.paging import LEAVES, MOVES, STAYS, fill_rows, place_keys, sort_rows
 from r3jax.mapping.config import MappingConfig
 from r3jax.mapping.join import merge
 from r3jax.mapping.state import MapState
-from r3jax.mapping.table import hash_on_host
 from r3jax.mapping.tile_files import Filed, Rows, Tile, TileFolder, Voxels
 from r3jax.mapping.update import MAX_LOAD
 
@@ -275,60 +276,52 @@ def _index(whole: np.ndarray) -> np.ndarray:
 def _exchange(state: MapState, tiles: Tiles, middle: Tile) -> tuple[MapState, Voxels]:
     """Moves rows between the table and the tiles: returns the table, and the other tiles."""
     lattice, size = tiles.lattice, float(state.voxel_size)
-    is_present, key = np.asarray(state.present), np.asarray(state.key)
-    stays = is_present & _lies_in(key, _indices_of(lattice, middle, size))
-    far, away = tiles.voxels, np.flatnonzero(is_present & ~stays)
+    key = np.asarray(state.key)
+    kinds = sort_rows(key, np.asarray(state.present), *_ends_of(lattice, middle, size))
+    far, away = tiles.voxels, np.flatnonzero(kinds == LEAVES)
     coming = [tile for tile in lattice.block(middle) if tile in far]
     if not coming and not len(away):
         return state, far
-    leaving = dict(tile_rows(_rows_of(state, away, _whole(key[:, away])), lattice, size))
+
+    def packed() -> dict[Tile, Rows]:
+        return dict(tile_rows(_rows_of(state, away, _whole(key[:, away])), lattice, size))
+
+    with ThreadPoolExecutor(1) as aside:
+        packing = aside.submit(packed)
+        new = _joined(_none_of(state), *_expanded_all((far[tile] for tile in coming), state))
+        num = int((kinds >= MOVES).sum()) + len(new["whole"])
+        if state.capacity == tiles.capacity and num <= MAX_LOAD * tiles.capacity:
+            table = table_of(new, state, tiles.capacity, kinds)
+        else:
+            left = np.flatnonzero(kinds >= MOVES)
+            rows = _joined(_rows_of(state, left, _whole(key[:, left])), new)
+            table = table_of(rows, state, tiles.capacity)
+        leaving = packing.result()
     assert not any(tile in far for tile in leaving), "a frame reached beyond the block"
     after = far.changed(coming, leaving)
     if tiles.folder is not None:
         after = tiles.folder.fit(after, middle)
-    new = _expanded_all((far[tile] for tile in coming), state)
-    num = int(stays.sum()) + sum(len(rows["whole"]) for rows in new)
-    fixed = None
-    if state.capacity == tiles.capacity and num <= MAX_LOAD * tiles.capacity:
-        # Most rows are where the first probe looks for them, whatever lies before others.
-        row = np.arange(state.capacity, dtype=np.uint32)
-        fixed = stays & ((hash_on_host(key) & np.uint32(state.capacity - 1)) == row)
-        stays = stays & ~fixed
-    moved = np.flatnonzero(stays)
-    rows = _joined([_rows_of(state, moved, _whole(key[:, moved])), *new])
-    return table_of(rows, state, tiles.capacity, fixed), after
+    return table, after
 
 
-def _lies_in(key: np.ndarray, ends: Iterable[tuple[int, int]]) -> np.ndarray:
-    """Finds the keys [2, n] of voxels between a first and a last index along each axis."""
-    low, high = key
-    index = low & _MASK21, (low >> 21) | ((high << 11) & _MASK21), high >> 10
-    is_in = np.ones(key.shape[1], bool)
-    for x, (first, last) in zip(index, ends, strict=True):
-        if (first, last) != (-INDEX_LIMIT, INDEX_LIMIT):
-            is_in &= (x >= np.uint32(first + INDEX_LIMIT)) & (x < np.uint32(last + INDEX_LIMIT))
-    return is_in
-
-
-def _indices_of(lattice: Lattice, middle: Tile, size: float) -> Iterable[tuple[int, int]]:
-    """Finds the first index of a voxel in a block, and the first beyond it, along each axis."""
-    corner = lattice.corner(middle)
+def _ends_of(lattice: Lattice, middle: Tile, size: float) -> tuple[np.ndarray, np.ndarray]:
+    """Finds the lowest and the highest index of a voxel in a block, in the bits of a key, [3]."""
+    corner, ends = lattice.corner(middle), np.array([[0] * 3, [int(_MASK21)] * 3])
     for axis in range(3):
         if lattice.num[axis] == 1:
-            yield -INDEX_LIMIT, INDEX_LIMIT
             continue
-        ends: list[int] = []
-        for side in (0, lattice.num[axis]):
+        for end, side in enumerate((0, lattice.num[axis])):
             # By the rule for tiles itself: rounding must not put a voxel into neither of two.
             near = int((corner[axis] + side * lattice.edge[axis]) / size)
             index = np.arange(near - 3, near + 4)
             tile = lattice.tiles_of(np.tile((index + 0.5) * size, (3, 1)))[axis]
             wanted = middle[axis] - lattice.num[axis] // 2 + side
-            ends.append(int(index[np.searchsorted(tile, wanted)]))
-        yield ends[0], ends[1]
+            ends[end, axis] = index[np.searchsorted(tile, wanted)] + INDEX_LIMIT - end
+    first, last = ends.astype(np.uint32)
+    return first, last
 
 
-def _joined(parts: list[_Arrays]) -> _Arrays:
+def _joined(*parts: _Arrays) -> _Arrays:
     """Joins arrays of rows."""
     return {name: np.concatenate([x[name] for x in parts], axis=-1) for name in parts[0]}
 
@@ -352,6 +345,10 @@ def _rows_of(state: MapState, rows: np.ndarray, whole: np.ndarray) -> _Arrays:
     return {"whole": whole} | {
         name: np.take(np.asarray(x), rows, axis=-1) for name, x in found.items() if x is not None
     }
+
+
+def _none_of(state: MapState) -> _Arrays:
+    return _rows_of(state, np.zeros(0, np.int64), np.zeros(0, np.uint64))
 
 
 def tile_rows(rows: _Arrays, lattice: Lattice, size: float) -> Iterable[tuple[Tile, Rows]]:
@@ -417,7 +414,7 @@ def _expanded(rows: Rows, *, counts_misses: bool) -> _Arrays:
 
 
 def table_of(
-    rows: _Arrays, like: MapState, capacity: int, fixed: np.ndarray | None = None
+    rows: _Arrays, like: MapState, capacity: int, kinds: np.ndarray | None = None
 ) -> MapState:
     """Builds a table of rows: of `capacity`, or larger if they need it.
 
@@ -425,30 +422,26 @@ def table_of(
         rows: rows of distinct voxels.
         like: a map with the same voxels.
         capacity: of the table.
-        fixed: rows of `like` that stay where they are, [N] bool: those that the first probe finds.
-            The table is then as large as `like`. None: none stays.
+        kinds: of `sort_rows`: rows of `like` that stay, or move within the table, which is then as
+            large as `like`. None: there are none.
     """
-    while fixed is None and len(rows["whole"]) > MAX_LOAD * capacity:
+    while kinds is None and len(rows["whole"]) > MAX_LOAD * capacity:
         capacity *= 2
     words = rows["whole"] & np.uint64(0xFFFFFFFF), rows["whole"] >> np.uint64(32)
     rows = rows | {"key": np.stack(words).astype(np.uint32)}
-    row = _places(rows["key"], np.zeros(capacity, bool) if fixed is None else fixed)
+    stays = np.zeros(capacity, np.uint8) if kinds is None else kinds
+    moved = np.flatnonzero(stays == MOVES)
+    key = np.concatenate([np.asarray(like.key)[:, moved], rows["key"]], axis=1)
+    row = _places(key, stays == STAYS)
     arrays: dict[str, Any] = {}
     for name, x in rows.items():
         if name != "whole":
             field = _aligned((*x.shape[:-1], capacity), x.dtype)
-            bits = field.view(f"u{x.itemsize}")
-            empty = EMPTY_WORD if name == "key" else 0
-            if fixed is None:
-                bits[:] = empty
-            else:  # six times as fast as a choice by element
-                mask = -fixed.astype(bits.dtype)
-                np.bitwise_and(np.asarray(getattr(like, name)).view(bits.dtype), mask, out=bits)
-                if empty:
-                    bits |= ~mask
-            # Row by row of the array: five times as fast as all of them at once.
-            for values, into in zip(np.atleast_2d(x), np.atleast_2d(field), strict=True):
-                into[row] = values
+            old = field if kinds is None else np.asarray(getattr(like, name))
+            words = (np.atleast_2d(a.view(f"u{x.itemsize}")) for a in (old, x, field))
+            empty = np.array(EMPTY_WORD if name == "key" else 0, f"u{x.itemsize}")[()]
+            for before, values, into in zip(*words, strict=True):
+                fill_rows(before, stays, moved, values, row, empty, into)
             arrays[name] = jax.device_put(field)
     return replace(like, **arrays)
 
@@ -508,7 +501,7 @@ class Union:
         return table_of(self._parts[0], like, like.capacity)
 
     def _unite(self) -> None:
-        self._parts = [_united(_joined(self._parts))]
+        self._parts = [_united(_joined(*self._parts))]
         self._united = len(self._parts[0]["whole"])
         if self._united > self._most:
             raise InputError(f"the maps hold more than {self._most} voxels")
@@ -544,29 +537,11 @@ def _aligned(shape: tuple[int, ...], kind: np.dtype) -> np.ndarray:
 
 
 def _places(key: np.ndarray, is_taken: np.ndarray) -> np.ndarray:
-    """Finds a row for each of distinct keys [2, n] in a table of which some rows [N] are taken.
-
-    Along the probes of `mapping.table`: all keys bid for a row, the last bidder gets it, and the
-    others go on to their next one.
-    """
-    capacity = len(is_taken)
-    is_taken, owner = is_taken.copy(), np.empty(capacity, np.int32)
-    hashed, row = hash_on_host(key), np.empty(key.shape[1], np.int64)
-    wanting = np.arange(key.shape[1], dtype=np.int32)
-    for probe in range(MAX_PROBES):
-        if not len(wanting):
-            return row
-        step = np.uint32(probe * (probe + 1) // 2)
-        slot = ((hashed + step) & np.uint32(capacity - 1)).astype(np.int64)
-        is_open = np.flatnonzero(~is_taken[slot])
-        bidding, slots = wanting[is_open], slot[is_open]
-        owner[slots] = bidding
-        row[bidding] = slots  # of those who lose it, too: they get another one later
-        is_taken[slots] = True
-        goes_on = np.ones(len(wanting), bool)
-        goes_on[is_open[owner[slots] == bidding]] = False
-        wanting, hashed = wanting[goes_on], hashed[goes_on]
-    raise RuntimeError(f"{len(wanting)} of {key.shape[1]} voxels found no row of {capacity}")
+    """Finds a row for each of distinct keys [2, n] in a table of which some rows [N] are taken."""
+    rows = place_keys(key, is_taken)
+    if (rows < 0).any():
+        raise RuntimeError(f"{(rows < 0).sum()} voxels found no row of {len(is_taken)}")
+    return rows
 
 
 def check_view(tiles: Tiles, camera: Camera, max_range: float, voxel_size: float) -> None:
@@ -586,7 +561,7 @@ def check_view(tiles: Tiles, camera: Camera, max_range: float, voxel_size: float
 def whole_map(state: MapState, tiles: Tiles) -> MapState:
     """Joins the rows at hand and those of all tiles in one table, as large as it must be."""
     more = _expanded_all(tiles.voxels.values(), state)
-    rows = _joined([_rows_of(state, *_present_rows(state)), *more])
+    rows = _joined(_rows_of(state, *_present_rows(state)), *more)
     return table_of(rows, state, state.capacity)
 
 
@@ -628,8 +603,7 @@ def merge_worlds(worlds: Sequence[World]) -> World:
             memory, disk = dict(fitting.memory), dict(fitting.disk)
     voxels = Voxels(memory, disk)
     coming = [tile for tile in tiles.lattice.block(tiles.middle) if tile in voxels]
-    none = _rows_of(state, np.zeros(0, np.int64), np.zeros(0, np.uint64))
-    rows = _joined([none, *_expanded_all((voxels[tile] for tile in coming), state)])
+    rows = _joined(_none_of(state), *_expanded_all((voxels[tile] for tile in coming), state))
     table = table_of(rows, state, tiles.capacity)
     # Voxels that any of them dropped are missing from the union, too.
     table = replace(table, dropped=jnp.int32(sum(int(s.dropped) for s, _, _ in worlds)))

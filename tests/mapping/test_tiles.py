@@ -10,10 +10,19 @@ from hypothesis import strategies as st
 
 import r3jax
 from r3jax.errors import InputError
+from r3jax.geometry.voxels import EMPTY_WORD
 from r3jax.kernels.constants import JOINED
+from r3jax.kernels.mapping.paging import (
+    MOVES,
+    STAYS,
+    fill_rows,
+    hash_of,
+    place_keys,
+    sort_rows,
+)
 from r3jax.mapping.join import grow, merge
 from r3jax.mapping.state import MapState, empty_map
-from r3jax.mapping.table import hash_key, hash_on_host
+from r3jax.mapping.table import find, hash_key
 from r3jax.mapping.tile_files import open_tile_folder
 from r3jax.mapping.tiles import (
     Tiles,
@@ -229,4 +238,28 @@ def test_far_positions_and_wider_cameras_are_refused():
                 max_size=8))  # fmt: skip
 def test_the_host_hashes_as_the_table_does(keys):
     keys = np.array(keys, np.uint32).T
-    np.testing.assert_array_equal(hash_on_host(keys), np.asarray(hash_key(*jnp.asarray(keys))))
+    found = [hash_of(low, high) for low, high in keys.T]
+    np.testing.assert_array_equal(found, np.asarray(hash_key(*jnp.asarray(keys))))
+
+
+@given(st.integers(0, 10**6), st.integers(0, 44))
+@settings(max_examples=20)
+def test_keys_placed_on_the_host_are_found_in_the_table(seed, num):
+    """Beside rows that stay, up to the load at which tables grow."""
+    rng = np.random.default_rng(seed)
+    index = rng.choice(1000, 44, replace=False)
+    keys = np.stack([index, index * 3]).astype(np.uint32)
+    table = np.full((2, 64), EMPTY_WORD, np.uint32)
+    stay, come = np.split(keys, [44 - num], axis=1)
+    table[:, place_keys(stay, np.zeros(64, bool))] = stay
+    # As when a block moves: rows that the first probe finds stay, all others are placed again.
+    block = np.array([[0] * 3, [2**21] * 3], np.uint32)
+    kinds = sort_rows(table, table[1] != EMPTY_WORD, *block)
+    moved = np.flatnonzero(kinds == MOVES)
+    others = np.concatenate([table[:, moved], come], axis=1)
+    rows, after = place_keys(others, kinds == STAYS), np.zeros_like(table)
+    for old, values, new in zip(table, come, after, strict=True):
+        fill_rows(old, kinds, moved, values, rows, np.uint32(EMPTY_WORD), new)
+    found = find(jnp.asarray(after), jnp.asarray(keys), jnp.ones(44, bool))
+    np.testing.assert_array_equal(after[:, np.asarray(found)], keys)
+    assert (after[1] != EMPTY_WORD).sum() == 44

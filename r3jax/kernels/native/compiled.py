@@ -92,12 +92,16 @@ def kept_on_disk(compiled: Callable[[bool], Any]) -> Any:
 def called_from_python(*, parallel: bool = False) -> Callable[[_Function], _Function]:
     """Compiles a kernel that Python calls, and other kernels may; the disk keeps it.
 
+    It runs without Python's lock: other threads go on.
+
     Args:
         parallel: its `prange` loops share the cores that the process may use.
     """
 
     def decorate(function: _Function) -> _Function:
-        compiler = lambda cache: njit(cache=cache, error_model="numpy", parallel=parallel)
+        compiler = lambda cache: njit(
+            cache=cache, error_model="numpy", parallel=parallel, nogil=True
+        )
         dispatcher = kept_on_disk(lambda cache: _compiled_by(compiler(cache), function))
         dispatcher.compile = in_one_piece()(dispatcher.compile)
         return dispatcher
