@@ -47,6 +47,9 @@ VOXELS_PER_AREA = 2.5
 """Voxels over one square of the floor as large as a voxel's face: floor, ceiling and walls of rooms
 of 6 m have 2.1."""
 
+STORY = 3.0
+"""Height of a story [m]. A block that is not cut into levels holds all stories of its box."""
+
 _MASK21 = np.uint32((1 << 21) - 1)
 
 
@@ -130,9 +133,10 @@ def longest_ray(camera: Camera) -> float:
 
 
 def capacity_for(lattice: Lattice, voxel_size: float) -> int:
-    """Chooses the rows of the table at hand: `VOXELS_PER_AREA` times the block's floor, at 70 %."""
-    x, y, _ = lattice.edge * np.array(lattice.num)
-    rows = VOXELS_PER_AREA * x * y / voxel_size**2 / MAX_LOAD
+    """Chooses the rows of the table at hand: `VOXELS_PER_AREA` times the block's floors, at 70 %."""
+    x, y, z = lattice.edge * np.array(lattice.num)
+    stories = max(1, round(z / STORY)) if lattice.num[2] == 1 else 1
+    rows = VOXELS_PER_AREA * x * y * stories / voxel_size**2 / MAX_LOAD
     return 1 << max(12, math.ceil(math.log2(rows)))
 
 

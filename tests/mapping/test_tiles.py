@@ -227,6 +227,14 @@ def test_capacity_follows_from_range_and_voxels():
     assert sizes == [1 << 20, 1 << 18]
 
 
+@pytest.mark.parametrize(("height", "rows"), [(2.6, 1 << 20), (5.4, 1 << 21), (9.9, 1 << 22)])
+def test_a_box_of_several_stories_has_room_for_all_of_them(height, rows):
+    config, box = r3jax.MappingConfig(), ENDLESS.copy()
+    box[:, 2] = 0.0, height
+    lattice = lattice_for(config, r3jax.Camera.from_fov(64, 64, 60.0), box)
+    assert capacity_for(lattice, config.voxel_size) == rows
+
+
 def test_far_positions_and_wider_cameras_are_refused():
     with pytest.raises(InputError, match="subtract an origin"):
         page(first_map(), {}, no_tiles(), np.array([1e6, 0.0, 0.0]))
