@@ -133,7 +133,7 @@ def longest_ray(camera: Camera) -> float:
 
 
 def capacity_for(lattice: Lattice, voxel_size: float) -> int:
-    """Chooses the rows of the table at hand: `VOXELS_PER_AREA` times the block's floors, at 70 %."""
+    """Chooses the rows at hand, a power of two: `VOXELS_PER_AREA` over all floors, at 70 %."""
     x, y, z = lattice.edge * np.array(lattice.num)
     stories = max(1, round(z / STORY)) if lattice.num[2] == 1 else 1
     rows = VOXELS_PER_AREA * x * y * stories / voxel_size**2 / MAX_LOAD

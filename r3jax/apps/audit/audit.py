@@ -43,7 +43,7 @@ from r3jax.captures.capture_maps import (
 from r3jax.captures.faults.faults import Faults, find_faults, stray_finding
 from r3jax.captures.neighborhoods import Neighborhood, neighborhoods
 from r3jax.captures.source import Source, thinned
-from r3jax.captures.standpoints import Places, inward_center, places_of
+from r3jax.captures.standpoints import Places, as_dense, inward_center, places_of
 from r3jax.captures.surfaces import with_surfaces
 from r3jax.captures.survey import RANGE, Survey, survey_of
 from r3jax.errors import InputError
@@ -226,7 +226,7 @@ def audit(
         seen.state,
         seen.grid,
         cameras,
-        settings.num_places,
+        as_dense(settings.num_places, cameras),
         is_dense=source.is_dense,
         meter=survey.alignment.scale if source.is_metric else None,
         center=center,
@@ -249,6 +249,7 @@ def audit(
         places,
         settings.views,
         start=cameras[-1],
+        most_places=settings.num_places,
         seed=settings.seed,
         on_view=step,
     )

@@ -402,10 +402,12 @@ def method(audit: Audit) -> list[str]:
             "on the dome of cameras around the object, not below the lowest of them and "
             f"{length(audit, 0.3)} from every voxel"
         )
+    num, searched = len(audit.places.eyes), audit.plan.num_searched
+    which = "" if searched == num else f"those {searched} around which most is lacking of "
     sentences.append(
-        f"Views: candidates are {len(audit.places.eyes)} positions {where}, with {DIRECTIONS} "
-        f"directions each; at least {100 * OVERLAP:.0f} % of a view must show known surfaces, so "
-        "that the picture can be registered. The candidate that raises the mean renderability of "
+        f"Views: candidates are {which}{num} positions {where}, with {DIRECTIONS} directions each; "
+        f"at least {100 * OVERLAP:.0f} % of a view must show known surfaces, so that the picture "
+        "can be registered. The candidate that raises the mean renderability of "
         "all surfaces most is simulated before the next one is chosen. The expected gain is the "
         "simulated one, less the shortfall measured in embedded scenes in which the pictures were "
         "really taken (docs/results/audit.md)."

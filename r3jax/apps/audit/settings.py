@@ -25,7 +25,8 @@ class AuditSettings(SurveySettings):
     """Number of further views to suggest."""
 
     num_places: int = 64
-    """Maximum number of positions searched for views."""
+    """Maximum number of positions searched for views. A place larger than 20 m has proportionally
+    more, of which those are searched around which most is lacking."""
 
     num_standpoints: int = 24
     """Maximum number of standpoints from which the surfaces are evaluated; proportionally more in

@@ -1,7 +1,8 @@
 """Suggests the most useful further views, one after another; each is simulated before the next.
 
 Candidates: for every place where a person could stand, a panorama (arXiv 2601.07484) gives the
-utility of all directions at once, and the best directions become candidate views. Views that show
+utility of all directions at once, and the best directions become candidate views. Where a building
+has more places than are searched, those come first around which most is lacking. Views that show
 too little known surface are left out. The gain in renderability over all surfaces is computed
 exactly, after `simulate_view`:
 
@@ -38,6 +39,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from scipy.spatial import KDTree
 
 from r3jax.apps.audit.diagnosis import (
     CAUSES,
@@ -55,7 +57,7 @@ from r3jax.geometry.cameras import Camera
 from r3jax.geometry.selection import for_selected
 from r3jax.geometry.sphere import fibonacci_lattice
 from r3jax.mapping.config import MappingConfig
-from r3jax.mapping.occupancy import OccupancyGrid
+from r3jax.mapping.occupancy import OccupancyGrid, centers_on_host
 from r3jax.mapping.state import MapState
 from r3jax.planning.candidates import poses_along
 from r3jax.planning.lazy_greedy import renew_best
@@ -229,6 +231,9 @@ class SuggestedViews:
     random_fine: tuple[float, ...]
     """Share of the surfaces that are fine after each random view."""
 
+    num_searched: int
+    """Number of places that were searched."""
+
     @property
     def ranked(self) -> tuple[Suggestion, ...]:
         """The views in the order in which they were chosen: the most useful first."""
@@ -332,6 +337,7 @@ def suggest(
     num: int,
     *,
     start: np.ndarray,
+    most_places: int,
     seed: int = 0,
     on_view: Callable[[], None] = lambda: None,
 ) -> SuggestedViews:
@@ -344,10 +350,14 @@ def suggest(
         places: positions at which a view may be taken.
         num: number of views; fewer are returned if no candidate gains enough.
         start: start of the walk, [3] [audit units].
+        most_places: number of places that are searched.
         seed: random seed of the random views.
         on_view: called after each view.
     """
-    greedy = LazyGreedy(task, candidate_poses(state, grid, task, places.eyes) if num else _NO_POSES)
+    searched = places.eyes
+    if num and len(searched) > most_places:
+        searched = searched[_lacking(state, grid, task, searched, most_places)]
+    greedy = LazyGreedy(task, candidate_poses(state, grid, task, searched) if num else _NO_POSES)
     key = jax.random.key(seed)
     memory = greedy.init(task.camera, grid, key=key)
     planner = Planner(state, grid, memory, greedy, MappingConfig())
@@ -374,7 +384,33 @@ def suggest(
     means, shares = (tuple(values) for values in zip(*drawn, strict=True)) if drawn else ((), ())
     eyes = np.array([view.pose[:3, 3] for view in views]).reshape(-1, 3)
     walk = tuple(views[i] for i in walking_order(eyes, start))
-    return SuggestedViews(walk, after if before is None else before, after, means, shares)
+    return SuggestedViews(walk, after if before is None else before, after, means, shares,
+                          len(searched))  # fmt: skip
+
+
+_CUBE = 1.0
+"""Edge of the cubes in which what is lacking is counted [audit units]."""
+
+
+def _lacking(
+    state: MapState, grid: OccupancyGrid, task: Task, places: np.ndarray, num: int
+) -> np.ndarray:
+    """Finds the places around which most is lacking, behind walls too, as indices [num].
+
+    A voxel lacks what its mean renderability falls short of 1, an unexplored cell its weight.
+    """
+    diagnosis = task.evaluate(state)[1]
+    seen, (x, y, z) = np.flatnonzero(diagnosis.is_seen), np.nonzero(np.asarray(grid.unexplored))
+    surfaces = np.asarray(state.center, np.float64)[:, seen].T
+    points = np.concatenate([surfaces, centers_on_host(grid, np.stack([x, y, z], axis=1))])
+    weight = np.full(len(points), float(task.config.lambda1))
+    weight[: len(seen)] = 1.0 - diagnosis.value[seen]
+    cubes, number = np.unique(np.floor(points / _CUBE).astype(np.int64), axis=0,
+                              return_inverse=True)  # fmt: skip
+    total = np.bincount(number.ravel(), weight, minlength=len(cubes))
+    near = KDTree((cubes + 0.5) * _CUBE).query_ball_point(places, float(task.config.max_range))
+    lacks = np.array([total[each].sum() for each in near])
+    return np.argsort(-lacks, kind="stable")[:num]
 
 
 def walking_order(eyes: np.ndarray, start: np.ndarray) -> list[int]:

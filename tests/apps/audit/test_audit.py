@@ -4,6 +4,8 @@ import json
 import re
 from dataclasses import replace
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -16,6 +18,7 @@ from r3jax.apps.audit.diagnosis import (
     NOT_KNOWN,
     Pictures,
     cause_of,
+    demand_of,
     known_rows,
     view_score,
 )
@@ -28,6 +31,7 @@ from r3jax.apps.audit.sentences import (
     verdict,
 )
 from r3jax.apps.audit.settings import AuditSettings
+from r3jax.apps.audit.suggest import Task, _lacking
 from r3jax.captures import capture_maps
 from r3jax.captures.camera_paths import CameraPath
 from r3jax.captures.source import Source, source_of
@@ -38,6 +42,7 @@ from r3jax.formats.errors import FormatError
 from r3jax.formats.nerfstudio import read_transforms
 from r3jax.formats.points import read_points
 from r3jax.formats.recordings import read_recording
+from r3jax.mapping.occupancy import centers_on_host
 from tests.apps.audit.room import (
     LENS,
     SIZE,
@@ -183,6 +188,25 @@ def test_a_gain_is_what_all_surfaces_gain_together(corner):
         # Voxels that are nearly perfect are left out of gains.
         assert view.gain == pytest.approx(surfaces + cells, rel=0.03, abs=0.5)
         before = view.mean_after
+
+
+def test_places_are_searched_around_which_most_is_lacking(corner):
+    state, grid = corner.seen.state, corner.seen.grid
+    config = eqx.tree_at(lambda c: c.max_range, corner.config, jnp.float32(2.0))
+    demand = demand_of(state, corner.standpoints, corner.config, np.asarray(state.present))
+    task = Task(corner.lens.camera, demand, config)
+    x, y, z = np.meshgrid(np.arange(0.2, 4.0, 0.2), np.arange(0.2, 3.0, 0.2), [0.8, 1.6])
+    places = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+    chosen = _lacking(state, grid, task, places, 20)
+    diagnosis = task.evaluate(state)[1]
+    surfaces = np.asarray(state.center, np.float64).T[diagnosis.is_seen]
+    cells = centers_on_host(grid, np.argwhere(np.asarray(grid.unexplored)))
+    gap = lambda points: np.linalg.norm(points[None] - places[:, None], axis=2)
+    lacks = ((gap(surfaces) <= 2.0) * (1.0 - diagnosis.value[diagnosis.is_seen])).sum(axis=1)
+    lacks += float(config.lambda1) * (gap(cells) <= 2.0).sum(axis=1)
+    # Cubes of a meter are counted, not voxels.
+    assert lacks[chosen].min() > np.percentile(lacks, 80)
+    assert len(np.unique(chosen)) == 20
 
 
 def test_regions_hold_bad_voxels_and_do_not_overlap(corner):
