@@ -1,6 +1,7 @@
 """Planners of places without end: what is at hand, ways to what is not, and views left there."""
 
 import itertools
+import threading
 from dataclasses import replace
 
 import jax
@@ -16,6 +17,7 @@ from r3jax.exploration.state import compilations
 from r3jax.mapping.occupancy import COSTMAP, KEEP_OUT, TRUSTED
 from r3jax.mapping.tiles import packed_layer, page, unpacked_layer, whole_map
 from r3jax.mapping.update import integrate_growing
+from r3jax.planning import far as far_module
 from r3jax.planning.columns import pixel_columns, polygon_columns
 from r3jax.planning.far import (
     Views,
@@ -351,6 +353,33 @@ def test_nothing_is_compiled_when_the_block_moves_and_leaves_views_behind():
     views = away.far.settled.views
     assert compilations.count == before > 0
     assert views.values["utility"][0] not in (0.0, 5.0)  # scored once more
+
+
+def test_a_frame_does_not_wait_for_what_the_block_leaves_behind(monkeypatch):
+    planner, here = in_a_corridor(a_policy())
+    left = a_view([0.1, 0.6, 0.6], here[:3, 3], 1.0, 5.0)
+    planner = replace(planner, far=replace(planner.far, views=left))
+    there, may_score, score = here[:3, 3] + [4.0, 0, 0], threading.Event(), far_module._renewed
+    at_once = at_hand(planner, there)
+    expected = at_once.far.settled
+
+    def held(*arguments):
+        assert may_score.wait(60.0)
+        return score(*arguments)
+
+    monkeypatch.setattr(far_module, "_renewed", held)
+    moved = at_hand(planner, there)
+    again = at_hand(
+        moved, there + np.array([4.0, 0.0, 0.0])
+    )  # a second block, while the first is not scored
+    np.testing.assert_array_equal(moved.map_state.key, at_once.map_state.key)
+    assert not moved.far.left.done()
+    assert not again.far.left.done()
+    may_score.set()
+    np.testing.assert_array_equal(moved.far.settled.views.pose, expected.views.pose)
+    for name, values in moved.far.settled.views.values.items():
+        np.testing.assert_array_equal(values, expected.views.values[name])
+    assert len(again.far.settled.views.path) >= len(expected.views.path) > 0
 
 
 def the_ring():
