@@ -146,4 +146,4 @@ BLOCKS_ACROSS = 64
 """Blocks per image row: 8 pixels of a 512-pixel row, 9 cm at 5 m with 60 degrees of view."""
 
 PASSED_OCTANTS = 4
-"""A cell is passed if so many of its eight octants' centers were seen through."""
+"""A cell is passed if at least this number of its eight octants' centers were seen through."""

@@ -397,7 +397,7 @@ def _lacking(
 ) -> np.ndarray:
     """Finds the places around which most is lacking, behind walls too, as indices [num].
 
-    A voxel lacks what its mean renderability falls short of 1, an unexplored cell its weight.
+    The deficit of a voxel is 1 less its mean renderability; that of an unexplored cell its weight.
     """
     diagnosis = task.evaluate(state)[1]
     seen, (x, y, z) = np.flatnonzero(diagnosis.is_seen), np.nonzero(np.asarray(grid.unexplored))
