@@ -403,9 +403,10 @@ def method(audit: Audit) -> list[str]:
             f"{length(audit, 0.3)} from every voxel"
         )
     num, searched = len(audit.places.eyes), audit.plan.num_searched
-    which = "" if searched == num else f"those {searched} around which most is lacking of "
+    which = f", of which the {searched} around which most is missing were searched"
+    which = "" if searched == num else which
     sentences.append(
-        f"Views: candidates are {which}{num} positions {where}, with {DIRECTIONS} directions each; "
+        f"Views: candidates are {num} positions {where}{which}, with {DIRECTIONS} directions each; "
         f"at least {100 * OVERLAP:.0f} % of a view must show known surfaces, so that the picture "
         "can be registered. The candidate that raises the mean renderability of "
         "all surfaces most is simulated before the next one is chosen. The expected gain is the "
