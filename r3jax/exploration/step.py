@@ -285,7 +285,9 @@ def _look(
     mission.on_stage("map")
     measures = mission.clock.measures
     position = np.asarray(frame.T_world_camera)[:3, 3]
-    planner, moving = timed(at_hand, state.planner, position, repeat_compiled=measures)
+    planner, moving = state.planner, 0.0
+    if planner.far is not None:
+        planner, moving = timed(at_hand, planner, position, repeat_compiled=measures)
     # On the map before the frame, for which the view was chosen.
     arrival = view_renderability(planner.map_state, frame.camera, frame.T_world_camera)
     planner, measured = timed(
