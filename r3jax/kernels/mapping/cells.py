@@ -32,20 +32,25 @@ def _add_row(depth, least, most):
 
 @kernel
 def _nearest_by_block(depth, block):
-    """Finds the least depth of each block of pixels; 0 where nothing was measured."""
+    """Finds the least depth of each block of pixels; 0 where nothing was measured.
+
+    Nothing is before one more at the end.
+    """
     height, width = depth.shape
-    nearest = np.empty(((height + block - 1) // block, (width + block - 1) // block), np.float32)
+    rows, columns = (height + block - 1) // block, (width + block - 1) // block
+    nearest = np.empty(rows * columns + 1, np.float32)
+    nearest[rows * columns] = -_INFINITE
     least, most = np.empty(width, np.float32), np.empty(width, np.float32)
-    for i in range(nearest.shape[0]):
+    for i in range(rows):
         for j in range(width):
             least[j], most[j] = _INFINITE, _ZERO
         for row in range(i * block, min((i + 1) * block, height)):
             _add_row(depth[row], least, most)
-        for j in range(nearest.shape[1]):
+        for j in range(columns):
             near, far = _INFINITE, _ZERO
             for column in range(j * block, min((j + 1) * block, width)):
                 near, far = min(near, least[column]), max(far, most[column])
-            nearest[i, j] = near if far > _ZERO else _ZERO
+            nearest[i * columns + j] = near if far > _ZERO else _ZERO
     return nearest
 
 
@@ -121,9 +126,10 @@ def _hits_of_row(depth, columns, y, frame, origin, size, bounds, none, places):
 @kernel
 def _mark_hits(frame, origin, size, bounds):
     """Marks the cells of the box that contain a measured point within range, [n + 1] uint8."""
-    depth, num = frame.depth, bounds[:, 1] - bounds[:, 0]
+    depth, none = frame.depth, 1
     height, width = depth.shape
-    none = num[0] * num[1] * num[2]
+    for axis in range(3):
+        none *= bounds[axis, 1] - bounds[axis, 0]
     is_hit = np.zeros(none + 1, np.uint8)
     columns, places = np.empty(width, np.float32), np.empty(width, np.int32)
     for j in range(width):
@@ -200,8 +206,9 @@ def _project_octants(frame, x, plane, shape, block, places, depths):
 def _octants_seen_through(frame, origin, size, first, shape):
     """Counts the octants of each cell of a box whose center was seen through, [X, Y, Z] uint8."""
     block, num = max(1, frame.depth.shape[1] // constants.BLOCKS_ACROSS), shape[1] * shape[2]
-    nearest = _nearest_by_block(frame.depth, block)
-    walls = np.append(nearest.reshape(nearest.size), -_INFINITE)  # nothing is before the last
+    height, width = frame.depth.shape
+    blocks = (height + block - 1) // block, (width + block - 1) // block
+    walls = _nearest_by_block(frame.depth, block)
     places, depths = np.empty(num, np.int32), np.empty(num, np.float32)
     counts, plane = (
         np.zeros((shape[0], num), np.uint8),
@@ -217,7 +224,7 @@ def _octants_seen_through(frame, origin, size, first, shape):
         for i in range(shape[0]):
             for side in (-_QUARTER, _QUARTER):
                 x = _center(origin[0], first[0] + i, side, size)
-                _project_octants(frame, x, flat, nearest.shape, np.float32(block), places, depths)
+                _project_octants(frame, x, flat, blocks, np.float32(block), places, depths)
                 for k in range(num):
                     is_before = depths[k] + _QUARTER * size <= walls[np.uint32(places[k])]
                     counts[i, k] += np.uint8(is_before)
@@ -252,19 +259,19 @@ def grid_depth(log_odds, origin, size, frame):
     if not frame.max_range > _ZERO:  # or NaN: a pose that is not valid
         return
     bounds = _bounds(frame, origin, size, log_odds.shape)
-    num = bounds[:, 1] - bounds[:, 0]
-    if min(num[0], num[1], num[2]) <= 0:
-        return
-    shape = num[0], num[1], num[2]
-    is_hit = _mark_hits(frame, origin, size, bounds)[:-1].reshape(shape)
-    counts = _octants_seen_through(frame, origin, size, bounds[:, 0], shape)
     x, y, z = bounds[0, 0], bounds[1, 0], bounds[2, 0]
-    for i in range(num[0]):
-        for j in range(num[1]):
+    shape = bounds[0, 1] - x, bounds[1, 1] - y, bounds[2, 1] - z
+    if min(shape[0], shape[1], shape[2]) <= 0:
+        return
+    is_hit = _mark_hits(frame, origin, size, bounds)
+    counts = _octants_seen_through(frame, origin, size, (x, y, z), shape)
+    for i in range(shape[0]):
+        for j in range(shape[1]):
+            first = (i * shape[1] + j) * shape[2]
             center = (
                 _center(origin[0], x + i, _ZERO, size),
                 _center(origin[1], y + j, _ZERO, size),
                 _center(origin[2], z, _ZERO, size),
             )
             row = log_odds[x + i, y + j, z : bounds[2, 1]]
-            _update_row(row, is_hit[i, j], counts[i, j], frame, center, size)
+            _update_row(row, is_hit[first : first + shape[2]], counts[i, j], frame, center, size)
