@@ -29,7 +29,6 @@ from r3jax.errors import InputError
 from r3jax.geometry.cameras import Camera
 from r3jax.geometry.voxels import EMPTY_WORD, INDEX_LIMIT, check_near_origin
 from r3jax.kernels.constants import JOINED, LOG_ODDS_LIMIT
-from r3jax.kernels.mapping.paging import LEAVES, MOVES, STAYS, fill_rows, place_keys, sort_rows
 from r3jax.mapping.config import MappingConfig
 from r3jax.mapping.join import merge
 from r3jax.mapping.state import MapState
@@ -279,6 +278,9 @@ def _index(whole: np.ndarray) -> np.ndarray:
 
 def _exchange(state: MapState, tiles: Tiles, middle: Tile) -> tuple[MapState, Voxels]:
     """Moves rows between the table and the tiles: returns the table, and the other tiles."""
+    # Only here, as below: Numba takes a second to load, and most planners hold no tiles.
+    from r3jax.kernels.mapping.paging import LEAVES, MOVES, sort_rows
+
     lattice, size = tiles.lattice, float(state.voxel_size)
     key = np.asarray(state.key)
     kinds = sort_rows(key, np.asarray(state.present), *_ends_of(lattice, middle, size))
@@ -429,6 +431,8 @@ def table_of(
         kinds: of `sort_rows`: rows of `like` that stay, or move within the table, which is then as
             large as `like`. None: there are none.
     """
+    from r3jax.kernels.mapping.paging import MOVES, STAYS, fill_rows
+
     while kinds is None and len(rows["whole"]) > MAX_LOAD * capacity:
         capacity *= 2
     words = rows["whole"] & np.uint64(0xFFFFFFFF), rows["whole"] >> np.uint64(32)
@@ -542,6 +546,8 @@ def _aligned(shape: tuple[int, ...], kind: np.dtype) -> np.ndarray:
 
 def _places(key: np.ndarray, is_taken: np.ndarray) -> np.ndarray:
     """Finds a row for each of distinct keys [2, n] in a table of which some rows [N] are taken."""
+    from r3jax.kernels.mapping.paging import place_keys
+
     rows = place_keys(key, is_taken)
     if (rows < 0).any():
         raise RuntimeError(f"{(rows < 0).sum()} voxels found no row of {len(is_taken)}")
