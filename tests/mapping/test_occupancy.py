@@ -349,7 +349,7 @@ def test_the_kernel_updates_the_cells_that_the_formulas_update(seed, lens, reach
     """In front of a tilted wall with a step; other cameras see the grid from outside, or not."""
     random = np.random.default_rng(seed)
     eye, aim = random.normal(size=3), random.normal(size=3)
-    low = eye - random.uniform([0.3, 0.3, 0.3], [3.7, 2.7, 1.7]) - (0.0 if is_inside else 2.0)
+    low = eye - random.uniform([1.0, 1.0, 0.7], [3.0, 2.0, 1.3]) - (0.0 if is_inside else 2.0)
     grid = empty_grid(low + np.array([[0.0, 0.0, 0.0], [4.0, 3.0, 2.0]]), CELL)
     before = random.uniform(-4.5, 4.5, grid.log_odds.shape).astype(np.float32)
     grid = eqx.tree_at(lambda g: g.log_odds, grid, jnp.asarray(before))
