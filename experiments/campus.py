@@ -214,7 +214,6 @@ def row_of(view: TakenView, planner: Planner, seconds: float) -> dict[str, Any]:
         "rows": planner.map_state.capacity,
         "voxels": row.coverage.voxels,
         "far_bytes": far.tiles.nbytes,
-        "views_left": len(far.settled.views.path),
         "trail": len(far.trails),
         "compiled": compilations.count,
         "memory": memory(),

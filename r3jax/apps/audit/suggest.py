@@ -400,9 +400,9 @@ def _lacking(
     The deficit of a voxel is 1 less its mean renderability; that of an unexplored cell its weight.
     """
     diagnosis = task.evaluate(state)[1]
-    seen, (x, y, z) = np.flatnonzero(diagnosis.is_seen), np.nonzero(np.asarray(grid.unexplored))
+    seen, cells = np.flatnonzero(diagnosis.is_seen), np.argwhere(np.asarray(grid.unexplored))
     surfaces = np.asarray(state.center, np.float64)[:, seen].T
-    points = np.concatenate([surfaces, centers_on_host(grid, np.stack([x, y, z], axis=1))])
+    points = np.concatenate([surfaces, centers_on_host(grid, cells)])
     weight = np.full(len(points), float(task.config.lambda1))
     weight[: len(seen)] = 1.0 - diagnosis.value[seen]
     cubes, number = np.unique(np.floor(points / _CUBE).astype(np.int64), axis=0,

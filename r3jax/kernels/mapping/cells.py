@@ -31,13 +31,12 @@ def _add_row(depth, least, most):
 
 
 @kernel
-def _nearest_by_block(depth, block):
+def _nearest_by_block(depth, block, rows, columns):
     """Finds the least depth of each block of pixels; 0 where nothing was measured.
 
     Nothing is before one more at the end.
     """
     height, width = depth.shape
-    rows, columns = (height + block - 1) // block, (width + block - 1) // block
     nearest = np.empty(rows * columns + 1, np.float32)
     nearest[rows * columns] = -_INFINITE
     least, most = np.empty(width, np.float32), np.empty(width, np.float32)
@@ -208,7 +207,7 @@ def _octants_seen_through(frame, origin, size, first, shape):
     block, num = max(1, frame.depth.shape[1] // constants.BLOCKS_ACROSS), shape[1] * shape[2]
     height, width = frame.depth.shape
     blocks = (height + block - 1) // block, (width + block - 1) // block
-    walls = _nearest_by_block(frame.depth, block)
+    walls = _nearest_by_block(frame.depth, block, blocks[0], blocks[1])
     places, depths = np.empty(num, np.int32), np.empty(num, np.float32)
     counts, plane = (
         np.zeros((shape[0], num), np.uint8),
