@@ -485,7 +485,8 @@ def _mark_by_kernel(
 ) -> MapState:
     is_visible = hidden_by_none(whole, frame, reach).astype(jnp.uint8)
     image = for_kernels(frame, reach, jnp.asarray(False))  # edges matter to pixels only
-    return with_rows(part, calls.map_mark(part.rows, image, is_visible, part.num_bins))
+    rows, *_ = calls.map_look(part.rows, part.mean, None, image, is_visible, part.num_bins)
+    return with_rows(part, rows)
 
 
 def united(parts: Sequence[MapState]) -> MapState:

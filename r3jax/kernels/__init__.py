@@ -6,8 +6,8 @@ compiled. A test compares each with its formula.
 | kernel | formula | test, in `tests` |
 |---|---|---|
 | `map_add` | `mapping.update.integrate_pixels` | `mapping/test_kernels.py` |
-| `map_mark` | `mapping.seen.rows_in_view`, `mark_rows` | `mapping/test_kernels.py` |
-| `map_miss` | `mapping.moved.count_misses` | `mapping/test_moved.py` |
+| `map_look` | `mapping.seen.rows_in_view`, `mark_rows` | `mapping/test_kernels.py` |
+| | `mapping.moved.count_misses` | `mapping/test_moved.py` |
 | `grid_depth` | `mapping.occupancy.integrate_depth` | `mapping/test_occupancy.py` |
 | `sums` | `scoring.formulas.sums_in_view` | `scoring/test_backends.py` |
 | `changes` | `scoring.formulas.change_of_sums` | `scoring/test_backends.py` |

@@ -12,7 +12,7 @@ from r3jax.kernels.calls import Cells, FrameArrays, Layout, MapRows, Views
 from r3jax.kernels.image_loss import loss_pass
 from r3jax.kernels.mapping.add import map_add
 from r3jax.kernels.mapping.cells import grid_depth
-from r3jax.kernels.mapping.mark import map_mark, map_miss
+from r3jax.kernels.mapping.mark import map_look
 from r3jax.kernels.native.compiled import inlined
 from r3jax.kernels.native.ffi import (
     ARGUMENTS,
@@ -115,39 +115,23 @@ def _map_add(frame):
     return 0
 
 
-def _map_mark(frame):
-    """Arguments: visited, resolution, key, voxel size, frame (11), visible, bins (2), workers."""
+def _map_look(frame):
+    """Arguments: rows, mean, misses (7), voxel size, frame (11), visible, bins (2), workers."""
     if answers_metadata(frame):
         return 0
-    map_mark(
-        words2(frame, RESULTS, 0),
-        floats1(frame, RESULTS, 1),
-        words2(frame, ARGUMENTS, 2),
-        float0(frame, ARGUMENTS, 3),
-        _image(frame, 4),
-        bytes1(frame, ARGUMENTS, 15),
-        ints2(frame, ARGUMENTS, 16),
-        floats2(frame, ARGUMENTS, 17),
-        np.int64(ints1(frame, ARGUMENTS, 18)[0]),
-    )
-    return 0
-
-
-def _map_miss(frame):
-    """Arguments: counts, m2, mean, misses, key, resolution, voxel size, frame (11), workers."""
-    if answers_metadata(frame):
-        return 0
-    map_miss(
-        floats1(frame, RESULTS, 0),
-        floats1(frame, RESULTS, 1),
-        floats2(frame, RESULTS, 2),
-        bytes1(frame, RESULTS, 3),
-        words2(frame, ARGUMENTS, 4),
-        floats1(frame, ARGUMENTS, 5),
-        float0(frame, ARGUMENTS, 6),
-        _image(frame, 7),
-        np.int64(ints1(frame, ARGUMENTS, 18)[0]),
-    )
+    map_look(
+        MapRows(
+            words2(frame, RESULTS, 0), words2(frame, RESULTS, 1), floats1(frame, RESULTS, 2),
+            floats1(frame, RESULTS, 3), floats1(frame, RESULTS, 4), float0(frame, ARGUMENTS, 7),
+        ),
+        floats2(frame, RESULTS, 5),
+        bytes1(frame, RESULTS, 6),
+        _image(frame, 8),
+        bytes1(frame, ARGUMENTS, 19),
+        ints2(frame, ARGUMENTS, 20),
+        floats2(frame, ARGUMENTS, 21),
+        np.int64(ints1(frame, ARGUMENTS, 22)[0]),
+    )  # fmt: skip
     return 0
 
 
@@ -359,10 +343,9 @@ def _adam(frame):
 # (`native.ahead`).
 HANDLERS = {
     "sums": _sums,
-    "map_mark": _map_mark,
     "map_add": _map_add,
+    "map_look": _map_look,
     "grid_depth": _grid_depth,
-    "map_miss": _map_miss,
     "pixels": _pixels,
     "changes": _changes,
     "composite": _composite,

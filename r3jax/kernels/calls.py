@@ -230,53 +230,41 @@ def map_add(
     return rows, mean, lost[0]
 
 
-def map_mark(
-    rows: MapRows, frame: FrameArrays, is_visible: UInt8[Array, " N"], num_bins: int
-) -> MapRows:
-    """Sets the direction bin of the rows that a frame shows, and raises their resolution.
+def map_look(
+    rows: MapRows,
+    mean: Float[Array, "3 N"],
+    misses: UInt8[Array, " N"] | None,
+    frame: FrameArrays,
+    is_visible: UInt8[Array, " N"],
+    num_bins: int,
+) -> tuple[MapRows, Float[Array, "3 N"], UInt8[Array, " N"] | None]:
+    """Removes the voxels that a frame sees through, and marks the rows that it shows, in place.
 
-    The formulas are `mapping.seen.rows_in_view` and `mark_rows`.
-
-    Args:
-        rows: of the map.
-        frame: the frame.
-        is_visible: 1 for rows that no other voxel hides, which count as seen even where depth
-            failed.
-        num_bins: direction bins of a voxel.
-    """
-    marks = [rows.visited, rows.resolution]
-    visited, resolution = _call(
-        "map_mark",
-        [*map(_like, marks)],
-        (marks, rows.key, rows.voxel_size, frame, is_visible, _bins(num_bins), _workers()),
-        input_output_aliases={0: 0, 1: 1},
-        vmap_method="sequential",
-    )
-    return rows._replace(visited=visited, resolution=resolution)
-
-
-def map_miss(
-    rows: MapRows, mean: Float[Array, "3 N"], misses: UInt8[Array, " N"], frame: FrameArrays
-) -> tuple[MapRows, Float[Array, "3 N"], UInt8[Array, " N"]]:
-    """Counts frames that see through each voxel, and removes voxels with enough of them, in place.
-
-    The formula is `mapping.moved.count_misses`.
+    The formulas are `mapping.moved.count_misses`, and `mapping.seen.rows_in_view` and `mark_rows`.
 
     Args:
         rows: of the map.
         mean: colors of the rows.
-        misses: number of frames that saw through each row so far.
+        misses: number of frames that saw through each row so far; None: no voxel is removed.
         frame: the frame.
+        is_visible: 1 for rows that no other voxel hides, which count as seen even where depth
+            failed.
+        num_bins: direction bins of a voxel.
+
+    Returns:
+        The rows, their colors and the numbers after the frame.
     """
-    changing = [rows.counts, rows.m2, mean, misses]
-    counts, m2, mean, misses = _call(
-        "map_miss",
-        [*map(_like, changing)],
-        (changing, rows.key, rows.resolution, rows.voxel_size, frame, _workers()),
-        input_output_aliases={i: i for i in range(4)},
+    *changing, voxel_size = rows
+    table = [*changing, mean, jnp.zeros(0, jnp.uint8) if misses is None else misses]
+    key, visited, counts, m2, resolution, mean, after = _call(
+        "map_look",
+        [*map(_like, table)],
+        (table, voxel_size, frame, is_visible, _bins(num_bins), _workers()),
+        input_output_aliases={i: i for i in range(len(table))},
         vmap_method="sequential",
     )
-    return rows._replace(counts=counts, m2=m2), mean, misses
+    rows = MapRows(key, visited, counts, m2, resolution, voxel_size)
+    return rows, mean, None if misses is None else after
 
 
 def grid_depth(

@@ -32,7 +32,7 @@ from r3jax.mapping.associate import (
 )
 from r3jax.mapping.join import Statistics, grow, join
 from r3jax.mapping.moved import count_misses
-from r3jax.mapping.seen import evidence_of_view, hidden_by_none, mark_seen
+from r3jax.mapping.seen import evidence_of_view, hidden_by_none, mark_rows, rows_in_view
 from r3jax.mapping.state import MapState, a_map
 
 _NEAR = 1000.0
@@ -127,9 +127,12 @@ def integrate_pixels(
 def _by_formulas(
     state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
 ) -> MapState:
-    # Pixels first: new voxels hide what lies behind them in this very frame.
+    # Pixels first: new voxels hide what lies behind them in this very frame; so do those that it
+    # removes.
     after = integrate_pixels(state, frame, max_range, drop_edges)
-    return mark_seen(count_misses(after, frame, max_range), frame, max_range)
+    seen = rows_in_view(after, frame, max_range)
+    after = count_misses(after, frame, max_range)
+    return mark_rows(after, seen, frame.position, frame.camera.focal)
 
 
 def _by_kernels(
@@ -139,11 +142,11 @@ def _by_kernels(
     after = _pixels_by_kernel(state, frame, max_range, drop_edges)
     factor = nan_unless_valid(frame.camera, frame.T_world_camera)
     image = for_kernels(frame, factor * max_range, drop_edges)
-    if after.misses is not None:
-        rows, mean, misses = calls.map_miss(after.rows, after.mean, after.misses, image)
-        after = with_rows(after, rows, mean=mean, misses=misses)
     is_visible = hidden_by_none(after, frame, max_range).astype(jnp.uint8)
-    return with_rows(after, calls.map_mark(after.rows, image, is_visible, state.num_bins))
+    rows, mean, misses = calls.map_look(
+        after.rows, after.mean, after.misses, image, is_visible, state.num_bins
+    )
+    return with_rows(after, rows, mean=mean, misses=misses)
 
 
 def add_pixels(
@@ -165,7 +168,7 @@ def _pixels_by_kernel(
     return with_rows(state, rows, mean=mean, dropped=state.dropped + lost)
 
 
-def with_rows(state: MapState, rows: calls.MapRows, **changed: Array) -> MapState:
+def with_rows(state: MapState, rows: calls.MapRows, **changed: Array | None) -> MapState:
     """Returns the map with the rows of a kernel's result, and other changed fields."""
     return replace(
         state,

@@ -1,7 +1,7 @@
 """Voxels in a frame's view: `mapping.seen` and `mapping.moved.count_misses` in machine code.
 
-`map_mark` sets the direction bins of voxels that the frame shows, `map_miss` removes those that it
-sees through.
+One pass over the rows lists those in view; of these it removes the voxels that the frame sees
+through, and sets the direction bins of those that it shows.
 """
 
 # Kernels have the types that Numba infers where they are called; annotations it would not read.
@@ -128,49 +128,6 @@ def _is_camera(frame, camera):
     return math.isfinite(total) & is_valid(camera)
 
 
-@kernel
-def map_mark(visited, resolution, key, voxel_size, frame, is_visible, bins, lattice, workers):
-    """Sets bins and resolutions of the rows that a frame shows, in place.
-
-    Args:
-        visited: words of bins [W, N].
-        resolution: best so far [N].
-        key: of the map [2, N].
-        voxel_size: edge [m].
-        frame: `calls.FrameArrays`.
-        is_visible: 1 where no other voxel hides a row [N].
-        bins: candidates of each octahedral cell [S^2, K].
-        lattice: directions of the bins [B, 3].
-        workers: threads.
-    """
-    camera = camera_of(frame, voxel_size)
-    if _is_camera(frame, camera):
-        _mark_all(visited, resolution, key, camera, frame, is_visible, bins, lattice, workers)
-
-
-@parallel_kernel
-def _mark_all(visited, resolution, key, camera, frame, is_visible, bins, lattice, workers):
-    depth, voxel_size, capacity = frame.depth, camera.voxel_size, key.shape[1]
-    flat, blocks = depth.reshape(depth.size), (capacity + _BLOCK - 1) // _BLOCK
-    for worker in prange(workers):
-        pixels, depths = np.empty(_BLOCK, np.int32), np.empty(_BLOCK, np.float32)
-        seen, visible = np.empty(_BLOCK, np.int32), np.empty(_BLOCK, np.int64)
-        for block in range(worker, blocks, workers):
-            first, size = block * _BLOCK, min(_BLOCK, capacity - block * _BLOCK)
-            num = _list_in_view(key, first, size, frame, voxel_size, pixels, depths, seen)
-            count = 0
-            for k in range(num):
-                if k + _AHEAD < num:
-                    prefetch(flat, np.int64(pixels[seen[k + _AHEAD]]))
-                i = np.int64(seen[k])
-                pixel = np.int64(pixels[i])
-                visible[count] = first + i
-                count += _is_shown(
-                    pixel, flat[pixel], depths[i], depth, voxel_size, is_visible[first + i] != 0
-                )
-            mark_rows(key, visited, resolution, visible, count, camera, bins, lattice)
-
-
 @inlined_fused
 def _is_open(depth, pixel, z, focal, size, slack):
     """Checks whether most pixels of a voxel's footprint see through it, and none shows it."""
@@ -192,57 +149,70 @@ def _is_open(depth, pixel, z, focal, size, slack):
     return 2 * beyond > total
 
 
+@inlined_fused
+def _miss(rows, mean, misses, row, pixel, z, frame):
+    """Counts a look through a voxel in view; removes one that was looked through often."""
+    depth, size, counts = frame.depth, rows.voxel_size, rows.counts
+    slack = _SLACK * size + _NOISE * z
+    measured = depth[pixel // depth.shape[1], pixel % depth.shape[1]]
+    if measured == _ZERO or measured < z - slack or counts[row] == _ZERO:
+        return
+    if measured <= z + slack:
+        misses[row] = 0
+        return
+    sharpness = frame.focal / z
+    if sharpness < _SHARE * rows.resolution[row] or sharpness * size < _LEAST:
+        return
+    if not _is_open(depth, pixel, z, max(frame.fx, frame.fy), size, slack):
+        return
+    misses[row] += 1
+    if misses[row] >= (constants.MISSES_OF_FEW if counts[row] <= _FEW else constants.MISSES):
+        misses[row] = 0
+        counts[row], rows.m2[row] = _ZERO, _ZERO
+        for channel in range(3):
+            mean[channel, row] = _ZERO
+
+
 @kernel
-def map_miss(counts, m2, mean, misses, key, resolution, voxel_size, frame, workers):
-    """Counts looks through each voxel, and removes those that were looked through often, in place.
+def map_look(rows, mean, misses, frame, is_visible, bins, lattice, workers):
+    """Removes the rows that a frame sees through, marks those that it shows, in place.
 
     Args:
-        counts: observations of each row [N].
-        m2: spread of the colors [N].
+        rows: of the map, `calls.MapRows`.
         mean: colors [3, N].
-        misses: looks through each row since it was last measured [N].
-        key: of the map [2, N].
-        resolution: best so far [N].
-        voxel_size: edge [m].
+        misses: looks through each row since it was last measured [N]; [0]: nothing is removed.
         frame: `calls.FrameArrays`.
+        is_visible: 1 where no other voxel hides a row [N].
+        bins: candidates of each octahedral cell [S^2, K].
+        lattice: directions of the bins [B, 3].
         workers: threads.
     """
-    camera = camera_of(frame, voxel_size)
+    camera = camera_of(frame, rows.voxel_size)
     if _is_camera(frame, camera):
-        _miss_all(counts, m2, mean, misses, key, resolution, voxel_size, frame, workers)
+        _look_at_all(rows, mean, misses, camera, frame, is_visible, bins, lattice, workers)
 
 
 @parallel_kernel
-def _miss_all(counts, m2, mean, misses, key, resolution, size, frame, workers):
-    depth, capacity = frame.depth, key.shape[1]
+def _look_at_all(rows, mean, misses, camera, frame, is_visible, bins, lattice, workers):
+    depth, key, voxel_size = frame.depth, rows.key, rows.voxel_size
+    capacity, removes = key.shape[1], misses.shape[0] > 0
     flat, blocks = depth.reshape(depth.size), (capacity + _BLOCK - 1) // _BLOCK
-    focal = max(frame.fx, frame.fy)
     for worker in prange(workers):
         pixels, depths = np.empty(_BLOCK, np.int32), np.empty(_BLOCK, np.float32)
-        seen = np.empty(_BLOCK, np.int32)
+        seen, visible = np.empty(_BLOCK, np.int32), np.empty(_BLOCK, np.int64)
         for block in range(worker, blocks, workers):
-            first, many = block * _BLOCK, min(_BLOCK, capacity - block * _BLOCK)
-            num = _list_in_view(key, first, many, frame, size, pixels, depths, seen)
+            first, size = block * _BLOCK, min(_BLOCK, capacity - block * _BLOCK)
+            num = _list_in_view(key, first, size, frame, voxel_size, pixels, depths, seen)
+            count = 0
             for k in range(num):
+                if k + _AHEAD < num:
+                    prefetch(flat, np.int64(pixels[seen[k + _AHEAD]]))
                 i = np.int64(seen[k])
-                row, z, pixel = first + i, depths[i], np.int64(pixels[i])
-                slack = _SLACK * size + _NOISE * z
-                measured = flat[pixel]
-                if measured == _ZERO or measured < z - slack or counts[row] == _ZERO:
-                    continue
-                if measured <= z + slack:
-                    misses[row] = 0
-                    continue
-                sharpness = frame.focal / z
-                if sharpness < _SHARE * resolution[row] or sharpness * size < _LEAST:
-                    continue
-                if not _is_open(depth, pixel, z, focal, size, slack):
-                    continue
-                misses[row] += 1
-                if misses[row] >= (
-                    constants.MISSES_OF_FEW if counts[row] <= _FEW else constants.MISSES
-                ):
-                    misses[row] = 0
-                    counts[row], m2[row] = _ZERO, _ZERO
-                    for channel in range(3):
-                        mean[channel, row] = _ZERO
+                row, pixel = first + i, np.int64(pixels[i])
+                if removes:
+                    _miss(rows, mean, misses, row, pixel, depths[i], frame)
+                visible[count] = row
+                count += _is_shown(
+                    pixel, flat[pixel], depths[i], depth, voxel_size, is_visible[row] != 0
+                )
+            mark_rows(key, rows.visited, rows.resolution, visible, count, camera, bins, lattice)
