@@ -209,7 +209,7 @@ def _integrate_jvp(primals: Any, tangents: Any) -> Any:
 
 # Two programs: whether an argument is donated is fixed when a function is jitted.
 _integrate_jitted = jax.jit(_integrate)
-_integrate_donating = jax.jit(_integrate, donate_argnums=0)
+_integrate_in_place = jax.jit(_integrate, donate_argnums=0)
 
 
 @checked(state=a_map, frame=a_frame)
@@ -252,8 +252,12 @@ def integrate(
     if not is_traced(frame.T_world_camera, state.voxel_size):
         _check_in_reach(state, frame)
     max_range = jnp.asarray(max_range, dtype=jnp.float32)
-    update = _integrate_donating if donate else _integrate_jitted
-    return update(state, frame, max_range, jnp.asarray(drop_edges))
+    arguments = frame, max_range, jnp.asarray(drop_edges)
+    if is_traced(*jax.tree.leaves((state, arguments))):  # within another program, nothing can be given away
+        return _integrate_jitted(state, *arguments)
+    if not donate:  # copied here, so that one program serves both
+        state = jax.tree.map(jnp.copy, state)
+    return _integrate_in_place(state, *arguments)
 
 
 def _check_in_reach(state: MapState, frame: Frame) -> None:
@@ -272,6 +276,7 @@ def integrate_growing(
     *,
     allow_growth: bool = True,
     drop_edges: bool = True,
+    donate: bool = False,
 ) -> MapState:
     """Adds a frame as `integrate` does, and doubles the table before it is 70 % full.
 
@@ -283,9 +288,15 @@ def integrate_growing(
         max_range: as in `integrate` [m].
         allow_growth: False keeps the capacity; voxels beyond it are counted in `dropped`.
         drop_edges: False keeps pixels on depth edges.
+        donate: `state` will not be used again: the table is updated in place where it has room for
+            a voxel in each pixel, so that it cannot have to grow.
     """
-    if not allow_growth:
-        return integrate(state, frame, max_range, drop_edges)
+    has_room = donate and (
+        not allow_growth
+        or int(state.num_occupied) + frame.depth.size <= MAX_LOAD * state.capacity
+    )
+    if has_room or not allow_growth:
+        return integrate(state, frame, max_range, drop_edges, donate=has_room)
     return update_growing(lambda now: integrate(now, frame, max_range, drop_edges), state)
 
 

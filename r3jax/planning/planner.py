@@ -208,14 +208,21 @@ def observe(planner: Planner, frame: Frame) -> Planner:
     return replace(take_in(planner, frame), reference=reference)
 
 
-def take_in(planner: Planner, frame: Frame) -> Planner:
-    """Adds a frame as `observe` does, without checking its pose, for simulators."""
+def take_in(planner: Planner, frame: Frame, *, donate: bool = False) -> Planner:
+    """Adds a frame as `observe` does, without checking its pose, for simulators.
+
+    Args:
+        planner: before the frame.
+        frame: a posed RGB-D image.
+        donate: the planner will not be used again, and its policy keeps no map.
+    """
     if planner.far is not None:
         config = planner.config
         check_view(planner.far.tiles, frame.camera, config.max_range, config.voxel_size)
         planner = at_hand(planner, np.asarray(frame.T_world_camera)[:3, 3])
     before = planner.map_state.capacity
-    map_state, grid = add_frame(planner.map_state, planner.grid, frame, planner.config)
+    known = planner.map_state, planner.grid
+    map_state, grid = add_frame(*known, frame, planner.config, donate=donate)
     if planner.far is not None and map_state.capacity > before:
         warnings.warn(
             f"the table at hand grows from {before} to {map_state.capacity} rows, for which "
@@ -581,15 +588,24 @@ def mark_starts(
 
 
 def add_frame(
-    map_state: MapState, grid: OccupancyGrid, frame: Frame, config: MappingConfig
+    map_state: MapState,
+    grid: OccupancyGrid,
+    frame: Frame,
+    config: MappingConfig,
+    *,
+    donate: bool = False,
 ) -> tuple[MapState, OccupancyGrid]:
-    """Adds a frame to a map and a grid, as `observe` does; the table grows."""
+    """Adds a frame to a map and a grid, as `observe` does; the table grows.
+
+    With `donate` the map must not be used again.
+    """
     map_state = integrate_growing(
         map_state,
         frame,
         config.max_range,
         allow_growth=config.allow_growth,
         drop_edges=config.drop_edges,
+        donate=donate,
     )
     # Depth before the body: free space of the body must not override hits of this frame.
     grid = _integrate_depth(grid, frame, config.max_range)

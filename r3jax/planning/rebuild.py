@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import replace
+from itertools import chain
 
 import equinox as eqx
 import jax
@@ -14,6 +15,7 @@ from r3jax.errors import InputError
 from r3jax.frame import Frame, read_ahead
 from r3jax.geometry.arguments import checked
 from r3jax.mapping.tile_files import Voxels
+from r3jax.planning.decide import GreedyPolicy
 from r3jax.planning.far import NO_VIEWS
 from r3jax.planning.planner import Planner, a_planner, first_map, mark_starts, take_in
 
@@ -67,7 +69,8 @@ def rebuild(
     after = replace(
         planner, map_state=first_map(config), grid=grid, policy_state=policy_state, far=far
     )
-    after = take_in(after, first)
-    for frame in frames:
-        after = take_in(after, frame)
+    # Between two frames no one else has this planner. A policy that is not ours may keep the map.
+    owned = isinstance(planner.policy, GreedyPolicy)
+    for frame in chain([first], frames):
+        after = take_in(after, frame, donate=owned)
     return after

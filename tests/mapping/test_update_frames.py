@@ -16,7 +16,7 @@ from r3jax.geometry.cameras import Camera
 from r3jax.mapping import update as real
 from r3jax.mapping.associate import edge_pixels, points_of_pixels
 from r3jax.mapping.state import MapState
-from r3jax.mapping.update import integrate, integrate_points
+from r3jax.mapping.update import integrate, integrate_growing, integrate_points
 from tests.mapping.reference import ReferenceMap, assert_same_rows, read_map
 from tests.mapping.sighted import NUM_BINS, assert_identical_rows, new_map
 from tests.strategies import VOXEL_SIZE
@@ -161,10 +161,10 @@ def test_sweeps_over_numbers_compile_once():
         sweep(new_map(CAPACITY, size), FRAMES[0], jnp.float32(max_range), jnp.asarray(drop))
     assert sweep._cache_size() == 1
     integrate(new_map(CAPACITY, 0.07), FRAMES[1], 4.0, True)
-    compiled = real._integrate_jitted._cache_size()  # with what earlier tests of the process needed
+    compiled = real._integrate_in_place._cache_size()  # with what earlier tests of the process needed
     for size, max_range, drop in [(0.2, 3, False), (0.4, jnp.float32(2), True)]:
         integrate(new_map(CAPACITY, size), FRAMES[1], max_range, drop)
-    assert real._integrate_jitted._cache_size() == compiled
+    assert real._integrate_in_place._cache_size() == compiled
 
 
 def test_a_map_may_be_updated_in_place():
@@ -172,6 +172,23 @@ def test_a_map_may_be_updated_in_place():
     for frame in FRAMES:
         state = integrate(state, frame, donate=True)
     assert_identical_rows(state, map_of(FRAMES, integrate))
+
+
+@pytest.mark.parametrize("capacity", [64, 1024])  # it must grow; it has room
+def test_a_map_that_grows_may_be_updated_in_place(capacity):
+    kept = given = new_map(capacity)
+    for frame in FRAMES:
+        kept, given = integrate_growing(kept, frame), integrate_growing(given, frame, donate=True)
+        assert int(given.dropped) == 0
+    assert kept.capacity == given.capacity
+    assert_identical_rows(kept, given)
+
+
+def test_a_map_that_is_not_given_away_stays():
+    before = map_of(FRAMES[:1], integrate)
+    rows = jax.tree.map(np.array, before)
+    integrate(before, FRAMES[1])
+    jax.tree.map(np.testing.assert_array_equal, before, rows)
 
 
 @pytest.mark.parametrize("max_range", [0.0, -1.0, np.nan])
