@@ -12,6 +12,8 @@ all of it at hand.
 Shape symbols: n cells; m columns; v views; X Y Z cells at hand.
 """
 
+import contextlib
+import ctypes
 import functools
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -369,6 +371,7 @@ def moved_to(known: Known, policy: GreedyPolicy, position: np.ndarray) -> Known:
     after, layers, tiles = page(map_state, layers_of(grid, memory), far.tiles, position)
     # Takes seconds in a large block, and no frame needs it: the next decision may wait for it.
     left = _ASIDE.submit(_left_behind, known, policy, tiles.middle, position)
+    _ASIDE.submit(_give_back_memory)
     far = replace(far, tiles=tiles, left=left)
     return after, far.grid(layers["log_odds"]), with_layers(memory, layers, far), far
 
@@ -381,6 +384,16 @@ def _left_behind(
     far = with_coarse(far.settled, grid, memory, policy.config)
     # Before they are out of hand: what they promise stays true until the robot comes back.
     return far.coarse, _renewed((map_state, grid, memory, far), policy, middle, position)
+
+
+def _give_back_memory() -> None:
+    """Returns freed memory to the system, where glibc would keep it.
+
+    A decision allocates and frees some hundred megabytes, and what lives on lies scattered between
+    them: without this a process grows by half a gigabyte in a thousand frames. Takes 10 ms.
+    """
+    with contextlib.suppress(AttributeError, OSError, TypeError):  # another C library
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def layers_of(grid: OccupancyGrid, memory: PlannerState) -> Layers:
