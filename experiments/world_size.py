@@ -225,16 +225,22 @@ def main(options: Options) -> Path:
 def draw(folder: Path) -> None:
     """Draws cost against the number of voxels, from the table in a folder."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
-    records = [json.loads(line) for line in (folder / "cost.jsonl").read_text().splitlines()]
+    rows = [json.loads(line) for line in (folder / "cost.jsonl").read_text().splitlines()]
+    # The latest of each: a side that is given twice warms up.
+    records = list({(r["side [m]"], r["map"]): r for r in rows}.values())
     figure = Figure(figsize=(7.0, 3.2), layout="constrained")
     for axes, part in zip(figure.subplots(1, 2), ("observe", "decide"), strict=True):
         for kind, marker in (("one table", "s--"), ("tiles", "o-")):
             points = [(r["voxels"], r[f"{part} [ms]"]) for r in records if r["map"] == kind]
             axes.loglog(*zip(*points, strict=True), marker, label=kind)
         axes.set(xlabel="voxels of the world", ylabel=f"{part} [ms]")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:.0f}"))
+        axes.yaxis.set_minor_locator(NullLocator())
         axes.grid(alpha=0.3)
-    figure.axes[1].legend(loc="center right")
+    figure.axes[1].legend(loc="upper right")
     figure.savefig(folder / "cost.png", dpi=120)
 
 
