@@ -16,6 +16,7 @@ from r3jax.geometry.voxels import EMPTY_WORD, INDEX_LIMIT
 from r3jax.kernels import constants
 from r3jax.kernels.constants import JOINED, MAX_PROBES
 from r3jax.kernels.mapping.bins import camera_of, is_valid, mark_rows
+from r3jax.kernels.mapping.paging import hash_of
 from r3jax.kernels.native.arithmetic import floor, high_word, low_word
 from r3jax.kernels.native.compiled import (
     in_wide_vectors,
@@ -325,20 +326,6 @@ _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 
 
 @inlined
-def _mix(h):
-    h = np.uint32((h ^ (h >> np.uint32(16))) * np.uint32(0x85EBCA6B))
-    h = np.uint32((h ^ (h >> np.uint32(13))) * np.uint32(0xC2B2AE35))
-    return np.uint32(h ^ (h >> np.uint32(16)))
-
-
-@inlined
-def _hash(low, high):
-    """Computes `table.hash_key`."""
-    h = _mix(np.uint32(low ^ np.uint32(0x9E3779B9)))
-    return _mix(np.uint32(h ^ np.uint32(high * np.uint32(0x85EBCA6B))))
-
-
-@inlined
 def _slot(hashed, probe, capacity):
     """Computes `table._slot`."""
     return np.int64(
@@ -353,13 +340,13 @@ def _find_rows(table, keys, workers, rows):
     for worker in prange(workers):
         begin, end = worker * count // workers, (worker + 1) * count // workers
         for i in range(begin, end):
-            rows[i] = _slot(_hash(keys[i, 0], keys[i, 1]), 0, capacity)
+            rows[i] = _slot(hash_of(keys[i, 0], keys[i, 1]), 0, capacity)
         for i in range(begin, end):
             if i + _AHEAD < end:
                 prefetch(table[0], rows[i + _AHEAD])
                 prefetch(table[1], rows[i + _AHEAD])
             low, high = keys[i, 0], keys[i, 1]
-            hashed, found, probe = _hash(low, high), np.int64(capacity), 0
+            hashed, found, probe = hash_of(low, high), np.int64(capacity), 0
             while probe < MAX_PROBES:
                 slot = _slot(hashed, probe, capacity)
                 if table[1, slot] == high and table[0, slot] == low:
@@ -388,7 +375,7 @@ def _claim_rows(table, keys, rows):
     while num > 0 and probe < MAX_PROBES:
         for k in range(num):
             group = wanting[k]
-            slot = _slot(_hash(keys[group, 0], keys[group, 1]), probe, capacity)
+            slot = _slot(hash_of(keys[group, 0], keys[group, 1]), probe, capacity)
             bids[k] = slot if table[1, slot] == _EMPTY else -1
         for k in range(num):
             if bids[k] >= 0:
