@@ -480,6 +480,14 @@ def adam(
     return (*after, applied[0] > 0)
 
 
+def compile_first(*names: str) -> None:
+    """Compiles kernels now, in this order, unless that is done: others may wait for a process."""
+    from r3jax.kernels.bridge import register
+
+    for name in names:
+        register(name)
+
+
 def _call(name: str, results: list[jax.ShapeDtypeStruct], arguments: Any, **options: Any) -> Any:
     """Calls a kernel, which is compiled (or loaded from disk) when its first call is traced."""
     from r3jax.kernels.bridge import register

@@ -139,6 +139,8 @@ def _by_kernels(
     state: MapState, frame: Frame, max_range: Float[Array, ""], drop_edges: Bool[Array, ""]
 ) -> MapState:
     """Integrates a frame by machine code."""
+    # `hidden_by_none` waits for the slowest kernel, which another process compiles meanwhile.
+    calls.compile_first("map_add", "map_look")
     after = _pixels_by_kernel(state, frame, max_range, drop_edges)
     factor = nan_unless_valid(frame.camera, frame.T_world_camera)
     image = for_kernels(frame, factor * max_range, drop_edges)
