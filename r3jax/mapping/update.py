@@ -255,7 +255,8 @@ def integrate(
         _check_in_reach(state, frame)
     max_range = jnp.asarray(max_range, dtype=jnp.float32)
     arguments = frame, max_range, jnp.asarray(drop_edges)
-    if is_traced(*jax.tree.leaves((state, arguments))):  # within another program, nothing can be given away
+    # Within another program nothing can be given away.
+    if is_traced(*jax.tree.leaves((state, arguments))):
         return _integrate_jitted(state, *arguments)
     if not donate:  # copied here, so that one program serves both
         state = jax.tree.map(jnp.copy, state)
@@ -294,8 +295,7 @@ def integrate_growing(
             a voxel in each pixel, so that it cannot have to grow.
     """
     has_room = donate and (
-        not allow_growth
-        or int(state.num_occupied) + frame.depth.size <= MAX_LOAD * state.capacity
+        not allow_growth or int(state.num_occupied) + frame.depth.size <= MAX_LOAD * state.capacity
     )
     if has_room or not allow_growth:
         return integrate(state, frame, max_range, drop_edges, donate=has_room)

@@ -161,7 +161,8 @@ def test_sweeps_over_numbers_compile_once():
         sweep(new_map(CAPACITY, size), FRAMES[0], jnp.float32(max_range), jnp.asarray(drop))
     assert sweep._cache_size() == 1
     integrate(new_map(CAPACITY, 0.07), FRAMES[1], 4.0, True)
-    compiled = real._integrate_in_place._cache_size()  # with what earlier tests of the process needed
+    # With what earlier tests of the process needed.
+    compiled = real._integrate_in_place._cache_size()
     for size, max_range, drop in [(0.2, 3, False), (0.4, jnp.float32(2), True)]:
         integrate(new_map(CAPACITY, size), FRAMES[1], max_range, drop)
     assert real._integrate_in_place._cache_size() == compiled
