@@ -44,7 +44,8 @@ class MappingConfig:
 
     tiles: bool = False
     """Hold what lies round the robot at hand and all else in tiles: for places larger than a house,
-    with r3, r3-pano, r3-ahead or frontier. The capacity then follows from range and voxel size."""
+    with r3, r3-pano, r3-ahead or frontier. The rows then follow from range and voxel size, where
+    `capacity` is not larger."""
 
     max_range: float = 5.0
     """Range of the depth sensor [m]."""

@@ -321,7 +321,7 @@ def first_far(
     middle = np.nan_to_num(np.clip(0.0, *box))
     start = np.asarray(starts[0], np.float64)[:3, 3] if starts else middle
     x, y, z = (int(i) for i in lattice.tiles_of(start[:, None])[:, 0])
-    capacity = capacity_for(lattice, config.voxel_size)
+    capacity = max(capacity_for(lattice, config.voxel_size), config.capacity)
     scoring = getattr(getattr(policy, "config", None), "scoring", None)
     sees = config.max_range if scoring is None else float(scoring.max_range)
     border = sees + config.cell_size

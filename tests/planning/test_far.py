@@ -496,6 +496,17 @@ def test_r3_ahead_explores_a_hall_to_its_end_by_tiles():
     assert farthest > 12.0
 
 
+def test_a_table_may_begin_larger_and_stays_so():
+    pose = pose_at([2.0, 2.0, 1.3], 0.0, 0.0)
+    given = replace(CONFIG, capacity=4 * far_at(pose[:3, 3]).tiles.capacity)
+    planner = r3jax.start(CAMERA, policy=a_policy(), starts=[pose], config=given)
+    planner = r3jax.observe(planner, frame_in_room(CAMERA, pose, room=HALL, noise=0.002, seed=0))
+    moved = at_hand(planner, np.array([9.0, 2.0, 1.3]))
+    assert moved.far.tiles.middle != planner.far.tiles.middle
+    for each in (planner, moved):
+        assert each.map_state.capacity == given.capacity
+
+
 @pytest.mark.full
 def test_a_hall_is_explored_to_its_end_by_tiles(tmp_path):
     """No bounds: map and tiles are the map without tiles, and a saved planner goes on alike."""
