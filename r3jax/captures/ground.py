@@ -20,6 +20,18 @@ from r3jax.mapping.occupancy import OccupancyGrid
 _WALKED = (0.5, 2.3)
 """Range of the cameras' median height over the floor in a walked capture [m]."""
 
+_HELD_LOW = 1.0
+"""Cameras lower than this over what is below them may all have been held over a table [m]."""
+
+_BESIDE = 2.0
+"""How far from the cameras the floor beside the table may lie [m]."""
+
+_LEAST_STEP = 0.3
+"""How far the floor lies below the table at least [m]."""
+
+_LEAST_FLOOR = 0.5
+"""Area that a floor shows at least [m2]."""
+
 _USUAL_HEIGHT = 1.5
 """Assumed height if the capture's unit is not known [m]."""
 
@@ -190,6 +202,9 @@ def ground_of(
     if is_known.sum() < max(3.0, _KNOWN_BELOW * len(cameras)):
         return None
     levels = _refined(origin[2] + cell * below[is_known], voxels, cameras[is_known], cell)
+    if meter is not None:
+        beside = _floor_beside(voxels, cameras[is_known], levels, meter, cell)
+        levels = np.minimum(levels, beside)
     held = float(np.median(cameras[is_known, 2] - levels))
     if meter is None:
         meter = held / _USUAL_HEIGHT
@@ -212,6 +227,35 @@ def _refined(tops: np.ndarray, voxels: np.ndarray, cameras: np.ndarray, cell: fl
         if len(height):
             found[i] = np.median(height)
     return found
+
+
+def _floor_beside(
+    voxels: np.ndarray, cameras: np.ndarray, levels: np.ndarray, meter: float, cell: float
+) -> float:
+    """Finds the floor beside a table that most cameras were held over; inf if there is none.
+
+    The lowest level with more surface than walls have at any height.
+    """
+    held = float(np.median(cameras[:, 2] - levels))
+    if held >= _HELD_LOW * meter:
+        return np.inf
+    lowest = np.median(cameras[:, 2]) - _WALKED[1] * meter
+    highest = np.median(levels) - _LEAST_STEP * meter
+    is_low = (voxels[:, 2] > lowest) & (voxels[:, 2] < highest)
+    low = voxels[is_low]
+    low = low[KDTree(cameras[:, :2]).query(low[:, :2])[0] <= _BESIDE * meter] if len(low) else low
+    if not len(low):
+        return np.inf
+    height = 0.5 * cell
+    step = np.floor((low[:, 2] - lowest) / height).astype(np.int64)
+    cells = np.column_stack([step, np.floor(low[:, :2] / cell).astype(np.int64)])
+    area = np.bincount(np.unique(cells, axis=0)[:, 0], minlength=int((highest - lowest) / height))
+    is_floor = (area * cell**2 >= _LEAST_FLOOR * meter**2) & (area >= 2.0 * np.median(area))
+    if not is_floor.any():
+        return np.inf
+    # A floor on the border of two steps lies in both.
+    first = int(np.argmax(is_floor))
+    return float(np.median(low[(step == first) | (step == first + 1), 2]))
 
 
 def is_free_at(grid: OccupancyGrid, places: np.ndarray) -> np.ndarray:

@@ -24,7 +24,7 @@ from scipy import ndimage
 
 from r3jax.captures.alignment import Alignment, evenly_spaced
 from r3jax.errors import InputError
-from r3jax.formats.colmap.reader import find_model
+from r3jax.formats.colmap.reader import main_model
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens, distorted, pinhole_lens
 from r3jax.formats.points import read_points
@@ -572,8 +572,10 @@ def _cloud(images: PosedImages) -> tuple[np.ndarray, np.ndarray]:
         xyz, rgb = read_points(images.points_path)
     else:
         is_file = images.path.suffix == ".json"
-        model = find_model(images.path.parent) if is_file else None
-        beside = "" if model is None else f"; the COLMAP model beside it has points: audit {model}"
+        model = main_model(images.path.parent) if is_file else None
+        beside = (
+            "" if model is None else f"; the COLMAP model beside it has points: audit {model[0]}"
+        )
         absent = "" if images.has_images else f", and {images.image_paths[0]} is missing, too"
         raise FormatError(
             images.path,

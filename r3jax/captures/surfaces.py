@@ -90,7 +90,10 @@ def _why_not_swept(source: Source) -> str | None:
     if source.photograph is None:
         return "the pictures are missing"
     if source.is_dense:
-        return "it already has depth images"
+        return (
+            "it already has depth images, which go first: audit a copy without them (of COLMAP's "
+            "stereo: without stereo/depth_maps)"
+        )
     if len(source) < _FEWEST_PHOTOS:
         return f"at least {_FEWEST_PHOTOS} pictures are needed, found {len(source)}"
     return None

@@ -77,6 +77,19 @@ def test_an_arm_reaches_over_the_edge_of_the_sofa():
     assert found.feet[0, 0] < SOFA[0, 0]
 
 
+@given(st.sampled_from([0.6, 0.8]), st.floats(0.5, 0.8), st.integers(0, 20))
+def test_a_table_below_all_cameras_is_no_floor(height, held, seed):
+    grid, voxels = room(height)
+    rng = np.random.default_rng(seed)
+    inside = SOFA[0] + (SOFA[1] - SOFA[0]) * rng.random((60, 2))
+    # Those near the edge, where an arm reaches: else no one could have held them.
+    near = inside[np.minimum(inside - SOFA[0], SOFA[1] - inside).min(axis=1) < 0.4]
+    cameras = np.column_stack([near, np.full(len(near), 0.2 + height + held)])
+    ground = ground_of(grid, voxels, cameras, 1.0)
+    assert ground is not None
+    np.testing.assert_allclose(ground.floor(cameras), 0.175, atol=0.05)
+
+
 @pytest.mark.parametrize("meter", [1.0, None])
 def test_where_nobody_walked_nothing_is_said_of_standing(meter):
     grid, voxels = room()

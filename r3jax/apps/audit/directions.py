@@ -25,6 +25,9 @@ _SAME_PLACE = 0.3
 """Pictures up to this much farther away than the nearest one count as equally near
 [audit units]."""
 
+_BODY = (0.2, 0.5, 0.8)
+"""Heights at which a body may meet an obstacle, as shares of the camera's height over the feet."""
+
 _ROUND = 10.0
 """Length added to a straight line that is blocked [audit units]."""
 
@@ -180,12 +183,13 @@ def way_to(source: Source, survey: Survey, seen: Seen, view: Suggestion) -> Way:
         view: the view to take.
     """
     poses = survey.alignment.poses(source.poses[survey.chosen])
-    nearest, is_blocked = _nearest(poses, seen, view)
+    nearest, is_blocked = _nearest(poses, seen.grid, view.pose, view.feet[2])
     here, meter = poses[nearest], survey.alignment.scale
     there = view.pose.copy()
     if view.is_over and np.isfinite(view.feet).all():
         there[:2, 3] = view.feet[:2]
-    steps = steps_between(here, there, meter, survey.unit, _order(here, there, seen.grid))
+    order = _order(here, there, seen.grid, view.feet[2])
+    steps = steps_between(here, there, meter, survey.unit, order)
     if view.is_over:
         steps.insert(1 if len(steps) > 2 else 0, _reach(there, view.pose, meter, survey.unit))
     like, share = _likest_picture(source, survey, seen, view)
@@ -208,8 +212,10 @@ def _reach(feet: np.ndarray, pose: np.ndarray, meter: float, unit: str) -> str:
     return f"hold the camera {spoken_length(out, unit)} out over the obstacle there"
 
 
-def _order(here: np.ndarray, there: np.ndarray, grid: OccupancyGrid) -> Order:
-    """Chooses an order of steps along which the camera meets no obstacle, if there is one."""
+def _order(
+    here: np.ndarray, there: np.ndarray, grid: OccupancyGrid, floor: float = np.nan
+) -> Order:
+    """Chooses an order of steps along which nobody meets an obstacle, if there is one."""
     forward, start = _ahead(here), here[:3, 3]
     offset = there[:3, 3] - start
     ahead = np.array([*(offset[:2] @ forward * forward), 0.0])
@@ -217,25 +223,39 @@ def _order(here: np.ndarray, there: np.ndarray, grid: OccupancyGrid) -> Order:
     corners = {"forward": start + ahead, "aside": start + level - ahead}
     ends = np.stack([start, there[:3, 3]])
     for order, corner in corners.items():
-        if not _is_blocked(grid, corner, ends).any():
+        if not _is_blocked(grid, corner, ends, floor).any():
             return "forward" if order == "forward" else "aside"
     return "straight"
 
 
-def _is_blocked(grid: OccupancyGrid, start: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Finds which straight lines from a place [3] to others [n, 3] meet an obstacle, [n] bool."""
+def _is_blocked(
+    grid: OccupancyGrid, start: np.ndarray, ends: np.ndarray, floor: float = np.nan
+) -> np.ndarray:
+    """Finds which straight ways from a place [3] to others [n, 3] meet an obstacle, [n] bool.
+
+    The camera does; over a known floor, the body below it, too.
+    """
     origin, cell = np.asarray(grid.origin, np.float64), float(grid.cell_size)
-    clear = ~np.asarray(grid.occupied)
-    return ~segments_are_inside(clear, (start - origin) / cell, (ends - origin) / cell)
+    clear, blocked = ~np.asarray(grid.occupied), np.zeros(len(ends), bool)
+    for share in (1.0, *_BODY) if np.isfinite(floor) else (1.0,):
+        down = (1.0 - share) * np.array([0.0, 0.0, 1.0])
+        a, b = (x + down * (np.nan_to_num(floor) - x[..., 2:]) for x in (start, ends))
+        blocked |= ~segments_are_inside(clear, (a - origin) / cell, (b - origin) / cell)
+    return blocked
 
 
-def _nearest(poses: np.ndarray, seen: Seen, view: Suggestion) -> tuple[int, bool]:
-    """Finds the nearest picture, by place and then by heading; True if the line is blocked."""
-    eye = view.pose[:3, 3]
-    is_blocked = _is_blocked(seen.grid, eye, poses[:, :3, 3])
-    cost = np.linalg.norm(poses[:, :3, 3] - eye, axis=1) + _ROUND * is_blocked
+def _nearest(
+    poses: np.ndarray, grid: OccupancyGrid, there: np.ndarray, floor: float
+) -> tuple[int, bool]:
+    """Finds the nearest picture, by place and then by heading; True if the way is blocked."""
+    eye, places = there[:3, 3], poses[:, :3, 3]
+    is_blocked = _is_blocked(grid, eye, places, floor)
+    distance = np.linalg.norm(places - eye, axis=1)
+    # Who turns on the spot meets nothing, whatever cell the camera is in.
+    is_blocked &= distance > float(grid.cell_size)
+    cost = distance + _ROUND * is_blocked
     near = np.flatnonzero(cost <= cost.min() + _SAME_PLACE)
-    turn = [abs(turn_between(poses[i], view.pose)) for i in near.tolist()]
+    turn = [abs(turn_between(poses[i], there)) for i in near.tolist()]
     best = int(near[int(np.argmin(turn))])
     return best, bool(is_blocked[best])
 

@@ -42,6 +42,10 @@ _UNIT = DepthUnit(1.0 / 5000.0)
 _SIZE = (640, 480)
 _DEFAULT = np.array([[525.0, 0.0, 319.5], [0.0, 525.0, 239.5], [0.0, 0.0, 1.0]])
 """Intrinsics of the benchmark's sensors [px]; pixel centers lie at whole numbers."""
+_ASSUMED = (
+    "There is no K.txt, so the intrinsics are the benchmark's defaults (fx = fy = 525, cx = 319.5, "
+    "cy = 239.5 pixels): write those of another camera into one, a 3x3 matrix."
+)
 
 
 def is_tum(path: Path) -> bool:
@@ -84,6 +88,7 @@ def read_tum(path: Path | str) -> PosedImages:
         depth_paths=tuple(depths[depth_at[i]] for i in chosen),
         depth_unit=_UNIT,
         up=up_of_poses(poses),
+        remark=None if (path / "K.txt").exists() else _ASSUMED,
     )
 
 

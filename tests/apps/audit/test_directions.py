@@ -4,6 +4,7 @@ import re
 from itertools import pairwise
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -112,6 +113,28 @@ def test_a_way_goes_through_nothing_where_one_of_three_does_not(seed):
     elif not meets(np.stack([eye[:2], aim[:2]])):
         said = legs(here, ", ".join(steps_between(here, there, 1.0, order=order)))
         assert np.linalg.norm(said[-1] - aim[:2]) <= 0.05 + 0.12 * np.linalg.norm((aim - eye)[:2])
+
+
+@pytest.mark.parametrize("floor", [0.2, np.nan])
+def test_a_table_between_two_places_stops_a_body_and_no_drone(floor):
+    free = np.zeros((33, 17, 14), bool)
+    free[1:32, 1:16, 1:13] = True
+    free[12:18, 1:16, 3:5] = False  # its top, from wall to wall
+    there, grid = pose_at([5.0, 1.6, 1.7], [9.0, 1.6, 1.7]), grid_of(free)
+    picture = pose_at([1.0, 1.6, 1.6], [2.0, 1.6, 1.6])
+    _, is_blocked = directions._nearest(picture[None], grid, there, floor)
+    assert is_blocked == np.isfinite(floor)
+    assert directions._order(picture, there, grid, floor) == (
+        "straight" if is_blocked else "forward"
+    )
+
+
+def test_turning_on_the_spot_meets_nothing():
+    free = np.zeros((33, 17, 14), bool)  # held against the thing that it looks at
+    there = pose_at([1.0, 1.6, 1.6], [9.0, 1.6, 1.6])
+    poses = np.stack([pose_at([1.0, 1.6, 1.6], [1.0, 2.6, 1.6]),
+                      pose_at([2.0, 1.6, 1.6], [2.0, 2.6, 1.6])])  # fmt: skip
+    assert directions._nearest(poses, grid_of(free), there, 0.2) == (0, False)
 
 
 def test_a_picture_that_looks_straight_down_faces_its_upper_edge():

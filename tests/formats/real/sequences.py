@@ -56,7 +56,8 @@ def _replica() -> Files:
 
 
 _Z = (0.0, 0.0, 1.0)
-_TUM = {"size": KINECT, "intrinsics": (525.0, 525.0, 320.0, 240.0), "poses_off": 2e-4, "up": _Z}
+_TUM = {"size": KINECT, "intrinsics": (525.0, 525.0, 320.0, 240.0), "poses_off": 2e-4, "up": _Z,
+        "remark": ("K.txt",)}  # fmt: skip
 _SEVEN = {"size": KINECT, "given": "data"}
 
 LAYOUTS = (
