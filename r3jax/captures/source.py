@@ -194,9 +194,9 @@ _MAX_POINTS = 500_000
 Picture = tuple[np.ndarray, np.ndarray]
 """Colors [h, w, 3] uint8 and z-depth [h, w] float32 in the capture's units; 0: unknown."""
 
-Kind = Literal["depth", "stereo", "sweep", "model", "tracks", "cloud"]
+Kind = Literal["depth", "stereo", "sweep", "model", "tracks", "cloud", "photos"]
 """Where depth comes from: a depth camera; COLMAP's stereo; our own sweep of planes; a trained
-splat; points with tracks; a cloud of points."""
+splat; points with tracks; a cloud of points; nowhere yet (`surfaces.with_surfaces` adds it)."""
 
 Photograph = tuple[np.ndarray, np.ndarray]
 """Colors [h, w, 3] uint8 of a thinned image, and brightness in [0, 1], [h, w] float32, as means
@@ -257,7 +257,7 @@ class Source:
     @property
     def is_dense(self) -> bool:
         """True if depth images say where space is free."""
-        return self.kind not in ("tracks", "cloud")
+        return self.kind not in ("tracks", "cloud", "photos")
 
     @property
     def is_complete(self) -> bool:
@@ -342,13 +342,13 @@ class Source:
         )
 
 
-def source_of(capture: Run | PosedImages, name: str, *, has_model: bool = False) -> Source:
+def source_of(capture: Run | PosedImages, name: str, *, can_compute: bool = False) -> Source:
     """Creates a source for an audit from any capture.
 
     Args:
         capture: the opened capture; for a recording, with unchanged poses (`up="z"`).
         name: name of the capture in reports.
-        has_model: True if depth will come from a trained splat: photos alone are enough then.
+        can_compute: True if `with_surfaces` will add depth: photos alone are enough then.
 
     Raises:
         FormatError: no images, neither depth nor points, a damaged cloud, or a lens that cannot
@@ -357,7 +357,7 @@ def source_of(capture: Run | PosedImages, name: str, *, has_model: bool = False)
     if not len(capture.rows if isinstance(capture, Run) else capture):
         raise FormatError(capture.path, "there are no views to audit")
     if isinstance(capture, PosedImages):
-        return _of_images(capture, name, has_model)
+        return _of_images(capture, name, can_compute)
     poses = np.stack([row.pose for row in capture.rows]).astype(np.float64)
     labels = tuple(f"view {row.step + 1}" for row in capture.rows)
     up = np.array([0.0, 0.0, 1.0])
@@ -373,7 +373,7 @@ def source_of(capture: Run | PosedImages, name: str, *, has_model: bool = False)
     return Source(name, poses, (lens,) * len(poses), labels, "depth", True, up, stride, read)
 
 
-def _of_images(images: PosedImages, name: str, has_model: bool) -> Source:
+def _of_images(images: PosedImages, name: str, can_compute: bool) -> Source:
     if len(images) > 2 and np.ptp(images.poses, axis=0).max() == 0.0:
         raise FormatError(
             images.path,
@@ -408,9 +408,9 @@ def _of_images(images: PosedImages, name: str, has_model: bool) -> Source:
             lambda index: _read_dense(images, index, stride, has_images), has_images, remark,
             photograph, images.reconstruction, images.photo_of,
         )  # fmt: skip
-    if has_model and has_images and not images.points and images.points_path is None:
+    if can_compute and has_images and not images.points and images.points_path is None:
         return Source(
-            name, images.poses, images.lenses, labels, "model", False, images.up, stride,
+            name, images.poses, images.lenses, labels, "photos", False, images.up, stride,
             lambda index: _read_colors(images, index, stride), has_images, remark, photograph,
             images.reconstruction, images.photo_of,
         )  # fmt: skip

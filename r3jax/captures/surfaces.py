@@ -22,8 +22,15 @@ from r3jax.captures.settings import Surfaces
 from r3jax.captures.source import Picture, Source, projected
 from r3jax.captures.sweep import Photo, agreed_depth, choose_sources, sweep
 from r3jax.errors import InputError
+from r3jax.formats.errors import FormatError
 from r3jax.splatting.ply import read_scene
 from r3jax.splatting.render import render
+
+_COARSE = 4
+"""Without points, photos this many times smaller are swept first, over all depths."""
+
+_DEPTHS = 24
+"""Depths that are assumed then."""
 
 _SWEPT_SIDE = 384
 """Photos are subsampled to at most this many pixels on the longer side; voxels are no finer."""
@@ -66,6 +73,8 @@ def with_surfaces(
         raise InputError(
             f"{source.name}: there are no depth images: --surfaces sweep computes depth from photos"
         )
+    if wanted == "points" and source.kind == "photos":
+        raise InputError(f"{source.name}: there are no points: drop --surfaces, or give a --model")
     if wanted == "points" and source.is_dense:
         raise InputError(f"{source.name}: depth images are better than points: drop --surfaces")
     if wanted in ("depth", "points") or (wanted == "auto" and source.is_dense):
@@ -76,6 +85,13 @@ def with_surfaces(
         why = _failed(source, found)
         if why is None:
             return found
+    if source.kind == "photos":
+        raise InputError(
+            f"{source.name}: there are neither depth images nor points, and no depth can be "
+            f"computed from its photos: {why}. An audit needs one of them (COLMAP's points3D, "
+            "nerfstudio's ply_file_path or depth_file_path), or a splat trained on the photos "
+            "(--model)"
+        )
     if wanted == "sweep":
         raise InputError(f"{source.name}: no depth can be computed from its photos: {why}")
     return source if source.reconstruction is None else _remarked(source, why)
@@ -208,35 +224,89 @@ def swept(source: Source, on_progress: Progress = lambda stage, steps: None) -> 
     """Adds depth swept from its photos to a capture, at most `_SWEPT_SIDE` pixels wide.
 
     Args:
-        source: images with points.
+        source: images, whose points tell at which depths surfaces lie. Without points, a sweep of
+            small photos over all depths does.
         on_progress: for a progress bar.
     """
     photograph = source.photograph
     assert photograph is not None
     side = max(max(lens.width, lens.height) for lens in source.lenses)
     stride = max(1, -(-side // _SWEPT_SIDE))
-    thin = dataclasses.replace(source, stride=stride)
     on_progress("reading photos", len(source))
+    colors: list[np.ndarray | FormatError] = []
     photos: list[Photo] = []
-    colors: list[np.ndarray] = []
-    points: list[np.ndarray] = []
     for index in range(len(source)):
-        rgb, gray = photograph(index, stride)
+        rgb, photo = _photo(source, index, stride)
         colors.append(rgb)
-        camera = thin.camera(index)
-        lens = np.array([float(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy)])
-        photos.append(Photo(gray, lens, source.poses[index]))
-        points.append(points_shown(source, index))
+        photos.append(photo)
         on_progress("", 1)
+    if all(isinstance(rgb, FormatError) for rgb in colors):
+        raise next(rgb for rgb in colors if isinstance(rgb, FormatError))
+    if source.kind == "photos":
+        points = _points_without(source, _COARSE * stride, on_progress)
+    else:
+        points = [
+            np.zeros((0, 3)) if isinstance(rgb, FormatError) else points_shown(source, index)
+            for index, rgb in enumerate(colors)
+        ]
     on_progress("sweeping depth from photos", len(source))
     found = sweep(photos, points.__getitem__, lambda: on_progress("", 1))
     # Masked pixels have no brightness.
     depths = [depth * (photo.gray > 0.0) for depth, photo in zip(found, photos, strict=True)]
 
     def read(index: int) -> Picture:
-        return colors[index], depths[index]
+        rgb = colors[index]
+        if isinstance(rgb, FormatError):
+            raise rgb
+        return rgb, depths[index]
 
     return dataclasses.replace(source, kind="sweep", stride=stride, read=read)
+
+
+def _photo(source: Source, index: int, stride: int) -> tuple[np.ndarray | FormatError, Photo]:
+    """Reads a thinned photo: its colors, and its brightness with lens and pose.
+
+    A photo that is missing or broken is all masked, and its colors are why.
+    """
+    assert source.photograph is not None
+    camera = dataclasses.replace(source, stride=stride).camera(index)
+    rgb: np.ndarray | FormatError
+    try:
+        rgb, gray = source.photograph(index, stride)
+    except FormatError as error:
+        rgb, gray = error, np.zeros((camera.height, camera.width), np.float32)
+    lens = np.array([float(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy)])
+    return rgb, Photo(gray, lens, source.poses[index])
+
+
+def _points_without(source: Source, stride: int, on_progress: Progress) -> list[np.ndarray]:
+    """Finds points that each image shows, [k, 3] in the world, where a capture has none.
+
+    By a sweep of small photos over all depths that the places of the cameras leave open.
+    """
+    photos = [_photo(source, index, stride)[1] for index in range(len(source))]
+    on_progress("sweeping small photos", len(source))
+    assumed = _assumed_points(photos)
+    depths = sweep(photos, assumed.__getitem__, lambda: on_progress("", 1))
+    return [_some_points(depth, photo, 2) for depth, photo in zip(depths, photos, strict=True)]
+
+
+def _assumed_points(photos: list[Photo]) -> list[np.ndarray]:
+    """Spreads points over the pixels of each image and over all plausible depths, [k, 3] each."""
+    centers = np.stack([photo.pose[:3, 3] for photo in photos])
+    extent = float(np.linalg.norm(np.ptp(centers, axis=0)))
+    few = min(10, len(photos) - 1)
+    apart = np.linalg.norm(centers[:, None] - centers[None], axis=-1)
+    around = float(np.median(np.sort(apart, axis=1)[:, few]))
+    points: list[np.ndarray] = []
+    for photo in photos:
+        step = max(1, min(photo.gray.shape) // 6)
+        every = [
+            _some_points(np.full(photo.gray.shape, depth, np.float32), photo, step)
+            for depth in np.geomspace(min(0.1 * extent, 0.3 * around), 20.0 * extent, _DEPTHS)
+        ]
+        points.append(np.concatenate(every))
+    return points
 
 
 def points_shown(source: Source, index: int) -> np.ndarray:
@@ -255,7 +325,10 @@ def _failed(source: Source, found: Source) -> str | None:
     kept: list[float] = []
     off: list[np.ndarray] = []
     for index in range(len(source)):
-        _, depth = found.read(index)
+        picture = found.try_read(index)
+        if isinstance(picture, FormatError):
+            continue
+        depth = picture[1]
         kept.append(float((depth > 0.0).mean()))
         off.append(_off(depth, found, index, points_shown(source, index)))
     share = np.mean(kept) / _unmasked(found)
@@ -275,7 +348,7 @@ def _unmasked(source: Source) -> float:
     """
     assert source.photograph is not None
     some = evenly_spaced(len(source), _COMPARED).tolist()
-    shown = [(source.photograph(index, source.stride)[1] > 0.0).mean() for index in some]
+    shown = [(_photo(source, index, source.stride)[1].gray > 0.0).mean() for index in some]
     return max(float(np.mean(shown)), 1e-3)
 
 

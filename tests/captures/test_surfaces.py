@@ -6,7 +6,9 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 
+import r3jax
 from r3jax.captures import surfaces
 from r3jax.captures.source import source_of
 from r3jax.captures.surfaces import with_surfaces
@@ -105,10 +107,59 @@ def test_a_splat_is_enough_for_photos_without_depth_and_points(tmp_path):
     capture = open_capture(folder)
     with pytest.raises(FormatError, match="--model"):
         source_of(capture.source, "room")
-    source = source_of(capture.source, "room", has_model=True)
+    source = source_of(capture.source, "room", can_compute=True)
     found = with_surfaces(source, model=wall_splat(tmp_path / "scene.ply"))
     known = np.mean([(found.read(index)[1] > 0.0).mean() for index in range(12)])
     assert found.kind == "model"
     assert known > 0.3
     with pytest.raises(InputError, match="covers 0 %"):
         with_surfaces(source, model=wall_splat(tmp_path / "scene.ply", shift=100.0))
+
+
+def photos_of_flat(folder, count: int) -> list[np.ndarray]:
+    """Writes photos of the flat with poses alone, from a line; returns their true depth."""
+    camera = r3jax.Camera.from_fov(256, 192, 70.0)
+    scene = r3jax.open_scene("flat", camera=camera, noise=0.0, max_range=None)
+    start = np.asarray(scene.start_pose, np.float64)
+    frames, depths = [], []
+    for index in range(count):
+        pose = start.copy()
+        pose[:3, 3] += (index - count / 2) * 0.1 * start[:3, 0]  # to the right
+        frame = scene.render(pose.astype(np.float32))
+        rgb = np.rint(255.0 * np.asarray(frame.rgb)).astype(np.uint8)
+        Image.fromarray(rgb).save(folder / f"{index}.png")
+        opengl = pose @ np.diag([1.0, -1.0, -1.0, 1.0])
+        frames.append({"file_path": f"{index}.png", "transform_matrix": opengl.tolist()})
+        depths.append(np.asarray(frame.depth))
+    names = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width", "h": "height"}
+    lens = {name: float(getattr(camera, of)) for name, of in names.items()}
+    (folder / "transforms.json").write_text(json.dumps(lens | {"frames": frames}))
+    return depths
+
+
+@pytest.mark.full
+def test_photos_with_poses_alone_are_swept(tmp_path):
+    truth = photos_of_flat(tmp_path, 12)
+    (tmp_path / "3.png").unlink()
+    source = source_of(open_capture(tmp_path).source, "flat", can_compute=True)
+    found = with_surfaces(source)
+    assert found.kind == "sweep"
+    assert isinstance(found.try_read(3), FormatError)
+    for index in (1, 5, 10):
+        depth = found.read(index)[1]
+        assert (depth > 0.0).mean() > 0.3
+        is_known = (depth > 0.0) & (truth[index] > 0.0) & np.isfinite(truth[index])
+        off = np.abs(depth[is_known] / truth[index][is_known] - 1.0)
+        assert np.median(off) < 0.03
+        assert np.mean(off < 0.1) > 0.9
+
+
+def test_photos_that_show_nothing_in_common_are_refused(tmp_path):
+    photos_of_flat(tmp_path, 4)
+    for index in range(4):  # without any texture
+        Image.new("RGB", (256, 192), (100, 100, 100)).save(tmp_path / f"{index}.png")
+    source = source_of(open_capture(tmp_path).source, "flat", can_compute=True)
+    with pytest.raises(InputError, match="no depth can be computed"):
+        with_surfaces(source)
+    with pytest.raises(InputError, match="no points"):
+        with_surfaces(source, "points")

@@ -164,7 +164,8 @@ def verdict(audit: Audit) -> list[str]:
     if audit.is_object:
         sentences.append(
             "The cameras look inward at an object, so it is evaluated from the dome of cameras "
-            "around it, not from where people could stand."
+            "around it, not from where people could stand. If it stands against a wall, skip the "
+            "views from behind that."
         )
     if audit.unseen:
         sentences.append(

@@ -236,7 +236,7 @@ def _source(path: Path) -> tuple[Source | None, str]:
     """Opens the pictures of an audit, or says why there are none."""
     try:
         capture = open_capture(path, "z")
-        return source_of(capture.source, capture.name, has_model=True), ""
+        return source_of(capture.source, capture.name, can_compute=True), ""
     except (ValueError, OSError, ImportError) as error:
         return None, f"Its pictures cannot be shown ({' '.join(str(error).split())})."
 

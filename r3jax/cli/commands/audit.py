@@ -56,8 +56,7 @@ def run_audit(options: AuditOptions) -> int:
             options.capture, "z", parse_topics(options.topics), options.terms.cut
         )
         path = None if options.path is None else path_of(options.path, capture.source)
-        has_model = options.terms.model is not None
-        source = source_of(capture.source, capture.name, has_model=has_model)
+        source = source_of(capture.source, capture.name, can_compute=True)
         _audit(options, source, path, progress)
     return 0
 

@@ -27,8 +27,7 @@ def run_select(options: SelectOptions) -> int:
     if is_video(options.capture):
         return _select_video(options, progress, console)
     capture = open_capture(options.capture, "z", parse_topics(options.topics), options.terms.cut)
-    has_model = options.terms.model is not None
-    source = source_of(capture.source, capture.name, has_model=has_model)
+    source = source_of(capture.source, capture.name, can_compute=True)
     folder = options.out or Path("runs") / "select" / source.name
     check_own(folder, "selection", "give another --out")
     with Stages(progress) as stages:
