@@ -215,7 +215,7 @@ def _reach(feet: np.ndarray, pose: np.ndarray, meter: float, unit: str) -> str:
 def _order(
     here: np.ndarray, there: np.ndarray, grid: OccupancyGrid, floor: float = np.nan
 ) -> Order:
-    """Chooses an order of steps along which nobody meets an obstacle, if there is one."""
+    """Chooses an order of steps along which no obstacle is met, if there is one."""
     forward, start = _ahead(here), here[:3, 3]
     offset = there[:3, 3] - start
     ahead = np.array([*(offset[:2] @ forward * forward), 0.0])
