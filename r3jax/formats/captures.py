@@ -317,6 +317,14 @@ def _frames(path: Path, names: list[str]) -> str | None:
 
 
 def _colmap(path: Path, names: list[str]) -> str | None:
+    for name in names:
+        ending = name[-4:]
+        cameras = name.removesuffix(f"points3D{ending}") + f"cameras{ending}"
+        if name.endswith(("points3D.txt", "points3D.bin")) and cameras not in names:
+            return (
+                f"this looks like a COLMAP model, but {path / name} has no cameras{ending} beside "
+                "it: copy the whole model, or write it again (colmap model_converter)"
+            )
     if not any(name.endswith("database.db") for name in names):
         return None
     return (

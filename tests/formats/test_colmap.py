@@ -291,6 +291,16 @@ def test_depth_of_colmaps_stereo_is_read_where_it_lies(dense):
     assert all(lens.is_pinhole for lens in images.lenses)
 
 
+def test_undistorted_images_do_where_the_photos_were_not_kept(dense):
+    """Without any depth of the stereo; with a photo of the model's own, that goes first."""
+    images = read_colmap(dense)
+    assert all(path.is_file() for path in images.image_paths)
+    assert all(lens.is_pinhole for lens in images.lenses)
+    (dense / "images" / "a").mkdir(parents=True)
+    Image.new("RGB", (20, 10)).save(dense / "images" / "a" / "first.png")
+    assert not all(lens.is_pinhole for lens in read_colmap(dense).lenses)
+
+
 @pytest.mark.parametrize(
     "data",
     [

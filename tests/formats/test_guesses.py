@@ -25,6 +25,10 @@ FOLDERS = {
         {"database.db": b"", "images/1.jpg": b""},
         r"COLMAP project without a model: colmap mapper --database_path \S+scan/database\.db",
     ),
+    "colmap, half of it": (
+        {"points3D.txt": b"", "images.txt": b"", "photos/1.jpg": b""},
+        r"COLMAP model, but \S+scan/points3D\.txt has no cameras\.txt beside it",
+    ),
     "metashape": (
         {"cameras.xml": b"", "images/1.jpg": b""},
         r"Metashape: ns-process-data metashape --data \S+scan --xml \S+scan/cameras\.xml",

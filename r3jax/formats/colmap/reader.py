@@ -124,7 +124,7 @@ def read_colmap(path: Path | str, images: Path | str | None = None) -> PosedImag
         path: the folder of the model, or the capture's, with the model in `sparse/0` or the like;
             if there are several, `sparse/1` and so on, the one with most images is taken. Where
             COLMAP's stereo has left depth (`dense/stereo/depth_maps`), its undistorted images with
-            that depth.
+            that depth; where only undistorted images are there, these.
         images: the folder that the images' names are relative to; by default the one of the usual
             names, beside the model or in one of the three folders above it, that holds most.
 
@@ -141,7 +141,10 @@ def read_colmap(path: Path | str, images: Path | str | None = None) -> PosedImag
     here = folder.resolve()
     names = dict(zip((image.name for image in ordered), lenses, strict=True))
     places = [path, here, *here.parents[:3]] if dense is None else [dense, path]
-    found = images or find_images(places, names) or path / "images"
+    found = images or find_images(places, names)
+    if found is None and (undistorted := _undistorted(path)) is not None:
+        return read_colmap(undistorted)  # the photos themselves were not kept
+    found = found or path / "images"
     image_paths = tuple(below(Path(found), image.name) for image in ordered)
     depths = [_stereo_depth(dense, image.name) for image in ordered]
     masks = [find_mask(Path(found).parent, image.name) for image in ordered]
@@ -158,6 +161,13 @@ def read_colmap(path: Path | str, images: Path | str | None = None) -> PosedImag
         is_stereo=any(depth is not None for depth in depths),
         reconstruction=reconstruction_of(model, len(unposed)),
     )
+
+
+def _undistorted(path: Path) -> Path | None:
+    """Finds what COLMAP's undistorter has written into a capture: images and their model."""
+    places = (path / name for name in _DENSE if name != ".")
+    is_one = lambda place: _holds_model(place / "sparse") and (place / "images").is_dir()
+    return next(filter(is_one, places), None)
 
 
 def main_model(path: Path) -> tuple[Path, ColmapModel] | None:
