@@ -28,11 +28,13 @@ from r3jax.formats.colmap.reader import main_model
 from r3jax.formats.errors import FormatError, naming
 from r3jax.formats.lenses import Lens, distorted, pinhole_lens
 from r3jax.formats.points import read_points
-from r3jax.formats.posed_images import PosedImages, Reconstruction
+from r3jax.formats.posed_images import IMAGE_FORMATS, PosedImages, Reconstruction
 from r3jax.frame import Frame
 from r3jax.geometry.cameras import Camera
 from r3jax.runs.reader import Run
+from r3jax.validation.errors import ForeignFileError
 from r3jax.validation.files import printable
+from r3jax.validation.images import shown_top
 
 
 class SamplingTable(NamedTuple):
@@ -250,6 +252,9 @@ class Source:
     photo_of: np.ndarray | None = None
     """Number of the photo that each image was cut from, [n]; None: each is a photo of its own."""
 
+    top: Callable[[int], tuple[int, int]] | None = None
+    """Reads where the top of an image's photo lies in its pixels (`shown_top`); None: above."""
+
     def __len__(self) -> int:
         """Returns the number of images."""
         return len(self.poses)
@@ -400,19 +405,20 @@ def _of_images(images: PosedImages, name: str, can_compute: bool) -> Source:
         remark = masked if remark is None else f"{remark} {masked}"
     remark = None if remark is None else printable(remark)
     photograph = (lambda index, by: _photograph(images, index, by)) if has_images else None
+    top = (lambda index: _top(images, index)) if has_images and images.pixels is None else None
     if any(path is not None for path in images.depth_paths):
         is_camera = not images.is_stereo
         return Source(
             name, images.poses, images.lenses, labels, "depth" if is_camera else "stereo",
             is_camera, images.up, stride,
             lambda index: _read_dense(images, index, stride, has_images), has_images, remark,
-            photograph, images.reconstruction, images.photo_of,
+            photograph, images.reconstruction, images.photo_of, top,
         )  # fmt: skip
     if can_compute and has_images and not images.points and images.points_path is None:
         return Source(
             name, images.poses, images.lenses, labels, "photos", False, images.up, stride,
             lambda index: _read_colors(images, index, stride), has_images, remark, photograph,
-            images.reconstruction, images.photo_of,
+            images.reconstruction, images.photo_of, top,
         )  # fmt: skip
     if images.points is not None and len(images.points.seen_point):
         kind: Kind = "tracks"
@@ -447,7 +453,7 @@ def _of_images(images: PosedImages, name: str, can_compute: bool) -> Source:
 
     return Source(
         name, images.poses, images.lenses, labels, kind, False, images.up, stride, read, has_images,
-        remark, photograph, images.reconstruction, images.photo_of,
+        remark, photograph, images.reconstruction, images.photo_of, top,
     )  # fmt: skip
 
 
@@ -498,6 +504,12 @@ def _check_points(images: PosedImages, xyz: np.ndarray, seen: np.ndarray | None)
             f"span {size:.3g} and the cameras {spread:.3g}, {apart:.3g} apart, so they are of "
             "another scene, scale or coordinate system; give the points of these poses",
         )
+
+
+def _top(images: PosedImages, index: int) -> tuple[int, int]:
+    with suppress(ForeignFileError, OSError):  # what cannot be read is named when all are
+        return shown_top(images.image_paths[index], IMAGE_FORMATS)
+    return 0, -1
 
 
 def _stride(lenses: tuple[Lens, ...] | list[Lens]) -> int:

@@ -28,7 +28,7 @@ from r3jax.captures.agreement import DepthImage, check_agreement
 from r3jax.captures.alignment import Alignment, evenly_spaced, rotation_to_z, up_of
 from r3jax.captures.settings import SurveySettings
 from r3jax.captures.source import Source
-from r3jax.captures.vertical import Vertical, block_normals, estimated_up
+from r3jax.captures.vertical import USED_POSES, Vertical, block_normals, estimated_up, upright
 from r3jax.errors import InputError
 from r3jax.formats.errors import FormatError
 from r3jax.frame import FAR
@@ -356,7 +356,12 @@ def _up(
         return Vertical(source.up)
     dense = images if source.is_dense else []
     seen = [block_normals(look.depth, look.camera, look.pose[:3, :3]) for look in dense]
-    return estimated_up(source.poses[chosen], seen)
+    poses = source.poses[chosen]
+    if source.top is not None:
+        few = evenly_spaced(len(chosen), USED_POSES)
+        tops = [source.top(index) for index in chosen[few].tolist()]
+        poses = np.stack([upright(*each) for each in zip(poses[few], tops, strict=True)])
+    return estimated_up(poses, seen)
 
 
 def _check_voxel(voxel: float, bounds: np.ndarray, scale: float) -> None:

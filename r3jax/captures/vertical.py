@@ -61,7 +61,7 @@ _PER_PLANE = 1.5
 _LATTICE, _BINS = 3000, 200
 """Directions that are tried, and bins in which directions count as distinct."""
 
-_USED_POSES, _USED_NORMALS = 32, 500
+USED_POSES, _USED_NORMALS = 32, 500
 """Evaluated of each capture, at most."""
 
 _AROUND, _STEPS = 5.0, 25
@@ -102,6 +102,19 @@ class Vertical:
 
     within: float | None = None
     """Uncertainty of the direction [deg]; None if it was given by the user or the format."""
+
+
+def upright(pose: np.ndarray, top: tuple[int, int]) -> np.ndarray:
+    """Turns a pose about its axis so that a photo's top lies above, [4, 4].
+
+    Args:
+        pose: `T_world_camera`.
+        top: where the top lies in the pixels, (column, row).
+    """
+    x, y = -top[1], top[0]  # the shown picture's right
+    turned = np.eye(4)
+    turned[:2, 0], turned[:2, 1] = (x, y), (-top[0], -top[1])
+    return pose @ turned
 
 
 def block_normals(depth: np.ndarray, camera: Camera, rotation: np.ndarray) -> Normals:
@@ -153,7 +166,7 @@ def estimated_up(poses: np.ndarray, seen: Sequence[Normals] = ()) -> Vertical:
         poses: `T_world_camera`, [n, 4, 4], n >= 1.
         seen: normals of its surfaces, of each depth image.
     """
-    rotations = poses[evenly_spaced(len(poses), _USED_POSES), :3, :3]
+    rotations = poses[evenly_spaced(len(poses), USED_POSES), :3, :3]
     normals = _thinned(seen)
 
     def log_posterior(up: np.ndarray) -> np.ndarray:

@@ -27,6 +27,9 @@ _ORIENTATION = 0x0112
 _QUARTER_TURNS = (5, 6, 7, 8)
 """Its values where width and height change places."""
 
+_TOPS = {3: (0, 1), 4: (0, 1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
+"""Where the top of the shown picture lies in the stored one (column, row), by that tag."""
+
 _WITH_ALPHA = ("LA", "PA", "RGBA", "La", "RGBa")
 """Pillow's modes of images with an alpha channel."""
 
@@ -46,6 +49,18 @@ def image_size(path: Path | bytes, formats: Sequence[str]) -> tuple[int, int]:
     """
     with _opened(path, formats) as image:
         return image.size
+
+
+def shown_top(path: Path, formats: Sequence[str]) -> tuple[int, int]:
+    """Reads where the top of a picture lies in its pixels, by EXIF: (0, -1) above, (-1, 0) left.
+
+    Phones store pictures as the sensor reads them, and how to turn them when they are shown.
+
+    Raises:
+        ForeignFileError, OSError: as `image_size`.
+    """
+    with _opened(path, formats) as image:
+        return _TOPS.get(image.getexif().get(_ORIENTATION, 1), (0, -1))
 
 
 def first_size(paths: Iterable[Path], formats: Sequence[str]) -> tuple[int, int]:

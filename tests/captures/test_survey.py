@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from r3jax.captures.agreement import DepthImage, check_agreement
 from r3jax.captures.settings import SurveySettings
 from r3jax.captures.source import Source, ray_lengths, source_of
 from r3jax.captures.survey import on_lattice, survey_of
+from r3jax.formats.captures import open_capture
 from r3jax.formats.recordings import read_recording
 from r3jax.geometry.cameras import Camera
 from r3jax.mapping.occupancy import empty_grid
@@ -21,6 +23,7 @@ from tests.apps.audit.room import (
     picture,
     pose_at,
     round_poses,
+    write_colmap,
     write_far_recording,
     write_recording,
 )
@@ -186,3 +189,17 @@ def test_coordinates_of_utm_lose_an_origin_and_no_digits(tmp_path):
         np.testing.assert_array_equal(second.depth, first.depth)
     back = other.alignment.poses_back(other.alignment.poses(source.poses))
     np.testing.assert_allclose(back[:, :3, 3] - far, near.poses[:, :3, 3], atol=1e-7)
+
+
+@pytest.mark.parametrize(("orientation", "quarters"), [(1, 0), (6, 1), (3, 2), (8, 3)])
+def test_photos_of_a_phone_on_its_side_stand_upright(tmp_path, orientation, quarters):
+    """As the sensor reads them, turned clockwise by so many quarters when they are shown."""
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec([0.0, 0.0, np.pi / 2 * quarters]).as_matrix()
+    folder = write_colmap(tmp_path, round_poses(12) @ turn)
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    for path in (folder / "images").iterdir():
+        Image.open(path).save(path, exif=exif)
+    survey = survey_of(source_of(open_capture(folder).source, "room"), SurveySettings())
+    assert survey.up.direction[2] > np.cos(np.radians(15.0))
