@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from r3jax.captures.alignment import evenly_spaced
-from r3jax.captures.source import ray_lengths, taken, thinned
+from r3jax.captures.source import lens_of, ray_lengths, taken, thinned
 from r3jax.errors import InputError
 from r3jax.geometry.cameras import Camera
 
@@ -68,7 +68,7 @@ class DepthImage:
 
     def points(self, most: int, rng: np.random.Generator) -> np.ndarray:
         """Samples points of the depth image, in the camera's frame, [n, 3]."""
-        return _points(self.depth, _lens_of(self.camera), most, rng)
+        return _points(self.depth, lens_of(self.camera), most, rng)
 
 
 class _Image(NamedTuple):
@@ -85,10 +85,6 @@ class _Image(NamedTuple):
 
     typical: float
     """Median depth of all images."""
-
-
-def _lens_of(camera: Camera) -> np.ndarray:
-    return np.array([float(value) for value in (camera.fx, camera.fy, camera.cx, camera.cy)])
 
 
 def _points(depth: np.ndarray, lens: np.ndarray, most: int, rng: np.random.Generator) -> np.ndarray:
@@ -109,7 +105,7 @@ def _coarser(images: Sequence[DepthImage]) -> list[_Image]:
         stride = max(1, -(-max(image.depth.shape) // _SIDE))
         rows, columns = (taken(side, stride) for side in image.depth.shape)
         depth = image.depth[rows[:, None], columns].astype(np.float64)
-        out.append(_Image(depth, _lens_of(thinned(image.camera, stride)), image.pose, 0.0))
+        out.append(_Image(depth, lens_of(thinned(image.camera, stride)), image.pose, 0.0))
     known = np.concatenate([x.depth[(x.depth > 0.0) & np.isfinite(x.depth)] for x in out])
     typical = float(np.median(known)) if len(known) else 1.0
     return [image._replace(typical=typical) for image in out]

@@ -78,6 +78,11 @@ def taken(side: int, stride: int) -> np.ndarray:
     return np.arange(min(stride // 2, side - 1), side, stride)
 
 
+def lens_of(camera: Camera) -> np.ndarray:
+    """Returns fx, fy, cx and cy on the host, [4] float64 [px]."""
+    return np.array([float(value) for value in (camera.fx, camera.fy, camera.cx, camera.cy)])
+
+
 def ray_lengths(shape: tuple[int, ...], lens: np.ndarray) -> np.ndarray:
     """Computes the lengths of the pixels' rays (x, y, 1), [h, w]: depth along the ray over z.
 
@@ -312,8 +317,7 @@ class Source:
         def read(index: int) -> Picture:
             rgb, depth = self.read(index)
             camera = self.camera(index)
-            lens = np.array([float(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy)])
-            lengths = ray_lengths(depth.shape, lens) if is_along_ray else 1.0
+            lengths = ray_lengths(depth.shape, lens_of(camera)) if is_along_ray else 1.0
             return rgb, (scale * depth / lengths).astype(np.float32)
 
         return dataclasses.replace(self, read=read)
@@ -576,6 +580,13 @@ _BRIGHTNESS = np.array([0.299, 0.587, 0.114], np.float32) / np.float32(255.0)
 """Weights of red, green and blue, of 8 bits."""
 
 
+NO_SURFACES = (
+    "there are neither depth images nor points: an audit needs one of them (COLMAP's points3D, "
+    "nerfstudio's ply_file_path or depth_file_path) or a splat trained on the photos (--model)"
+)
+"""What is said where nothing tells where surfaces lie."""
+
+
 def _cloud(images: PosedImages) -> tuple[np.ndarray, np.ndarray]:
     """Returns the points without tracks: no image is known to see them (as in a PLY)."""
     if images.points is not None and len(images.points):
@@ -584,16 +595,16 @@ def _cloud(images: PosedImages) -> tuple[np.ndarray, np.ndarray]:
         xyz, rgb = read_points(images.points_path)
     else:
         is_file = images.path.suffix == ".json"
-        model = main_model(images.path.parent) if is_file else None
+        model = None
+        with suppress(FormatError):  # of another capture: it is only named
+            model = main_model(images.path.parent) if is_file else None
         beside = (
             "" if model is None else f"; the COLMAP model beside it has points: audit {model[0]}"
         )
         absent = "" if images.has_images else f", and {images.image_paths[0]} is missing, too"
         raise FormatError(
             images.path,
-            "there are neither depth images nor points: an audit needs one of them (COLMAP's "
-            "points3D, nerfstudio's ply_file_path or depth_file_path) or a splat trained on "
-            f"the photos (--model){absent}{beside}",
+            f"{NO_SURFACES}{absent}{beside}",
         )
     if len(xyz) > _MAX_POINTS:
         chosen = np.random.default_rng(0).choice(len(xyz), _MAX_POINTS, replace=False)

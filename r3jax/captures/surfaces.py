@@ -19,7 +19,7 @@ import numpy as np
 
 from r3jax.captures.alignment import evenly_spaced
 from r3jax.captures.settings import Surfaces
-from r3jax.captures.source import Picture, Source, projected
+from r3jax.captures.source import NO_SURFACES, Picture, Source, lens_of, projected
 from r3jax.captures.sweep import Photo, agreed_depth, choose_sources, sweep
 from r3jax.errors import InputError
 from r3jax.formats.errors import FormatError
@@ -86,12 +86,7 @@ def with_surfaces(
         if why is None:
             return found
     if source.kind == "photos":
-        raise InputError(
-            f"{source.name}: there are neither depth images nor points, and no depth can be "
-            f"computed from its photos: {why}. An audit needs one of them (COLMAP's points3D, "
-            "nerfstudio's ply_file_path or depth_file_path), or a splat trained on the photos "
-            "(--model)"
-        )
+        raise InputError(f"{source.name}: {NO_SURFACES}; no depth can be computed from them: {why}")
     if wanted == "sweep":
         raise InputError(f"{source.name}: no depth can be computed from its photos: {why}")
     return source if source.reconstruction is None else _remarked(source, why)
@@ -158,7 +153,6 @@ def modeled(
     alike: list[float] = []
     for index in range(len(source)):
         camera = thin.camera(index)
-        lens = np.array([float(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy)])
         drawn = render(scene, camera, jnp.asarray(source.poses[index], dtype=jnp.float32))
         rgb = np.clip(np.asarray(drawn.rgb), 0.0, 1.0)
         gray = rgb.mean(axis=-1).astype(np.float32)
@@ -170,7 +164,7 @@ def modeled(
         else:
             photo = np.rint(255.0 * rgb).astype(np.uint8)
         colors.append(photo)
-        photos.append(Photo(gray, lens, source.poses[index]))
+        photos.append(Photo(gray, lens_of(camera), source.poses[index]))
         on_progress("", 1)
     _check_model(source, thin, path, depths, alike)
     shown = [_some_points(depth, photo) for depth, photo in zip(depths, photos, strict=True)]
@@ -228,8 +222,6 @@ def swept(source: Source, on_progress: Progress = lambda stage, steps: None) -> 
             small photos over all depths does.
         on_progress: for a progress bar.
     """
-    photograph = source.photograph
-    assert photograph is not None
     side = max(max(lens.width, lens.height) for lens in source.lenses)
     stride = max(1, -(-side // _SWEPT_SIDE))
     on_progress("reading photos", len(source))
@@ -243,7 +235,7 @@ def swept(source: Source, on_progress: Progress = lambda stage, steps: None) -> 
     if all(isinstance(rgb, FormatError) for rgb in colors):
         raise next(rgb for rgb in colors if isinstance(rgb, FormatError))
     if source.kind == "photos":
-        points = _points_without(source, _COARSE * stride, on_progress)
+        points = _points_without(photos, on_progress)
     else:
         points = [
             np.zeros((0, 3)) if isinstance(rgb, FormatError) else points_shown(source, index)
@@ -275,20 +267,27 @@ def _photo(source: Source, index: int, stride: int) -> tuple[np.ndarray | Format
         rgb, gray = source.photograph(index, stride)
     except FormatError as error:
         rgb, gray = error, np.zeros((camera.height, camera.width), np.float32)
-    lens = np.array([float(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy)])
-    return rgb, Photo(gray, lens, source.poses[index])
+    return rgb, Photo(gray, lens_of(camera), source.poses[index])
 
 
-def _points_without(source: Source, stride: int, on_progress: Progress) -> list[np.ndarray]:
+def _points_without(photos: list[Photo], on_progress: Progress) -> list[np.ndarray]:
     """Finds points that each image shows, [k, 3] in the world, where a capture has none.
 
     By a sweep of small photos over all depths that the places of the cameras leave open.
     """
-    photos = [_photo(source, index, stride)[1] for index in range(len(source))]
-    on_progress("sweeping small photos", len(source))
-    assumed = _assumed_points(photos)
-    depths = sweep(photos, assumed.__getitem__, lambda: on_progress("", 1))
-    return [_some_points(depth, photo, 2) for depth, photo in zip(depths, photos, strict=True)]
+    on_progress("sweeping small photos", len(photos))
+    small = [_smaller(photo) for photo in photos]
+    depths = sweep(small, _assumed_points(small).__getitem__, lambda: on_progress("", 1))
+    return [_some_points(depth, photo, 2) for depth, photo in zip(depths, small, strict=True)]
+
+
+def _smaller(photo: Photo) -> Photo:
+    """Averages blocks of `_COARSE` by `_COARSE` pixels; one with a masked pixel is masked."""
+    height, width = (n // _COARSE for n in photo.gray.shape)
+    blocks = photo.gray[: height * _COARSE, : width * _COARSE]
+    blocks = blocks.reshape(height, _COARSE, width, _COARSE)
+    gray = np.where(blocks.min(axis=(1, 3)) > 0.0, blocks.mean(axis=(1, 3)), np.float32(0.0))
+    return Photo(gray, photo.lens / _COARSE, photo.pose)
 
 
 def _assumed_points(photos: list[Photo]) -> list[np.ndarray]:

@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from r3jax.formats.colmap.reader import find_model, read_colmap
@@ -318,11 +318,10 @@ def _frames(path: Path, names: list[str]) -> str | None:
 
 def _colmap(path: Path, names: list[str]) -> str | None:
     for name in names:
-        ending = name[-4:]
-        cameras = name.removesuffix(f"points3D{ending}") + f"cameras{ending}"
-        if name.endswith(("points3D.txt", "points3D.bin")) and cameras not in names:
+        cameras = PurePosixPath(name).with_stem("cameras")
+        if name.endswith(("points3D.txt", "points3D.bin")) and str(cameras) not in names:
             return (
-                f"this looks like a COLMAP model, but {path / name} has no cameras{ending} beside "
+                f"this looks like a COLMAP model, but {path / name} has no {cameras.name} beside "
                 "it: copy the whole model, or write it again (colmap model_converter)"
             )
     if not any(name.endswith("database.db") for name in names):

@@ -24,9 +24,6 @@ MAX_PHOTO = 1 << 27
 _ORIENTATION = 0x0112
 """EXIF's tag of how an image is turned when it is shown."""
 
-_QUARTER_TURNS = (5, 6, 7, 8)
-"""Its values where width and height change places."""
-
 _TOPS = {3: (0, 1), 4: (0, 1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
 """Where the top of the shown picture lies in the stored one (column, row), by that tag."""
 
@@ -118,7 +115,8 @@ def _other_size(image: Any, size: tuple[int, int]) -> str:
         f"{wanted_width} x {wanted_height}"
     )
     turn = image.getexif().get(_ORIENTATION, 1)
-    if image.size == (wanted_height, wanted_width) and turn in _QUARTER_TURNS:
+    is_quarter = _TOPS.get(turn, (0, -1))[0] != 0
+    if image.size == (wanted_height, wanted_width) and is_quarter:
         said += (
             f": its pixels are stored on their side (EXIF orientation {turn}), turn them by "
             "`mogrify -auto-orient`"

@@ -15,6 +15,7 @@ from r3jax.captures.surfaces import with_surfaces
 from r3jax.errors import InputError
 from r3jax.formats.captures import open_capture
 from r3jax.formats.errors import FormatError
+from r3jax.formats.nerfstudio import OPENGL_FROM_OPENCV
 from r3jax.kernels.constants import SH0
 from r3jax.splatting.ply import write_scene
 from r3jax.splatting.scene import GaussianScene
@@ -128,7 +129,7 @@ def photos_of_flat(folder, count: int) -> list[np.ndarray]:
         frame = scene.render(pose.astype(np.float32))
         rgb = np.rint(255.0 * np.asarray(frame.rgb)).astype(np.uint8)
         Image.fromarray(rgb).save(folder / f"{index}.png")
-        opengl = pose @ np.diag([1.0, -1.0, -1.0, 1.0])
+        opengl = pose @ OPENGL_FROM_OPENCV
         frames.append({"file_path": f"{index}.png", "transform_matrix": opengl.tolist()})
         depths.append(np.asarray(frame.depth))
     names = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width", "h": "height"}

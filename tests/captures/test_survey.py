@@ -193,7 +193,7 @@ def test_coordinates_of_utm_lose_an_origin_and_no_digits(tmp_path):
 
 @pytest.mark.parametrize(("orientation", "quarters"), [(1, 0), (6, 1), (3, 2), (8, 3)])
 def test_photos_of_a_phone_on_its_side_stand_upright(tmp_path, orientation, quarters):
-    """As the sensor reads them, turned clockwise by so many quarters when they are shown."""
+    """Stored as the sensor reads them; shown, they are turned clockwise by 90 degrees a quarter."""
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_rotvec([0.0, 0.0, np.pi / 2 * quarters]).as_matrix()
     folder = write_colmap(tmp_path, round_poses(12) @ turn)
