@@ -43,7 +43,7 @@ from r3jax.mapping.occupancy import (
 )
 from r3jax.mapping.state import MapState, empty_map
 from r3jax.mapping.tile_files import TILE_MEMORY, open_tile_folder
-from r3jax.mapping.tiles import ACROSS, check_view, whole_map
+from r3jax.mapping.tiles import check_view, whole_map
 from r3jax.mapping.update import integrate_growing
 from r3jax.planning.columns import Plane, cells_of, pixel_columns, polygon_columns, without
 from r3jax.planning.decide import GreedyPolicy, PlannerState, with_others
@@ -224,11 +224,13 @@ def take_in(planner: Planner, frame: Frame, *, donate: bool = False) -> Planner:
     known = planner.map_state, planner.grid
     map_state, grid = add_frame(*known, frame, planner.config, donate=donate)
     if planner.far is not None and map_state.capacity > before:
+        lattice, rows = planner.far.tiles.lattice, map_state.capacity
+        width, depth, _ = lattice.edge * np.array(lattice.num)
         warnings.warn(
-            f"the table at hand grows from {before} to {map_state.capacity} rows, for which "
-            f"everything is compiled: {int(map_state.num_occupied)} voxels lie within "
-            f"{np.max(planner.far.tiles.lattice.edge) * ACROSS:.0f} m; larger voxels, a shorter "
-            "max_range or bounds that hold one floor make them fewer",
+            f"the table at hand grows from {before} to {rows} rows, for which everything is "
+            f"compiled: {int(map_state.num_occupied)} voxels lie in the {width:.0f} x {depth:.0f} "
+            f"m at hand; MappingConfig(capacity={rows}) begins with as many, and larger voxels, a "
+            "shorter max_range or bounds that hold one floor make them fewer",
             stacklevel=3,
         )
     return tell_policy(replace(planner, map_state=map_state, grid=grid), frame)

@@ -1,6 +1,8 @@
 """Planners of places without end: what is at hand, ways to what is not, and views left there."""
 
+import functools
 import itertools
+import re
 import threading
 from dataclasses import replace
 
@@ -14,6 +16,7 @@ from hypothesis import strategies as st
 import r3jax
 from r3jax.errors import InputError, PathError
 from r3jax.exploration.state import compilations
+from r3jax.mapping import tiles as tiles_module
 from r3jax.mapping.occupancy import COSTMAP, KEEP_OUT, TRUSTED
 from r3jax.mapping.tiles import packed_layer, page, unpacked_layer, whole_map
 from r3jax.mapping.update import integrate_growing
@@ -505,6 +508,20 @@ def test_a_table_may_begin_larger_and_stays_so():
     assert moved.far.tiles.middle != planner.far.tiles.middle
     for each in (planner, moved):
         assert each.map_state.capacity == given.capacity
+
+
+def test_a_table_that_grows_says_how_much_floor_it_holds(monkeypatch):
+    monkeypatch.setattr(tiles_module, "VOXELS_PER_AREA", 0.01)
+    pose = pose_at([2.0, 2.0, 1.3], 0.0, 0.0)
+    box = np.array([[0.0, 0.0, 0.0], [60.0, 60.0, 9.0]])
+    config = replace(CONFIG, tiles=True, capacity=1 << 12)
+    planner = r3jax.start(CAMERA, box, a_policy(), starts=[pose], config=config)
+    assert planner.far.tiles.lattice.num[2] == 1  # as high as its box, and not cut
+    frames = [frame_in_room(CAMERA, pose_at(pose[:3, 3], yaw, 0.0), room=HALL)
+              for yaw in np.arange(0.0, 360.0, 30.0)]  # fmt: skip
+    x, y, _ = np.array(planner.grid.log_odds.shape) * CONFIG.cell_size
+    with pytest.warns(UserWarning, match=re.escape(f"the {x:.0f} x {y:.0f} m at hand")):
+        functools.reduce(r3jax.observe, frames, planner)
 
 
 @pytest.mark.full
