@@ -102,13 +102,20 @@ TABLES: dict[TableName, dict[str, Row]] = {
         for policy in POLICIES
         for mode, loop in MODES.items()
     },
-    # Rivals, most with a map of their own: at what it costs here with `--clock wall`, else as if
+    # Others, most with a map of their own: at what it costs here with `--clock wall`, else as if
     # it took no longer than ours.
     "rivals": {
         OURS: Row("r3-ahead", loop=ON_THE_WAY),
         **{
             policy + mode: Row(policy, OURS, loop=loop)
-            for policy in (REFERENCE, "gavis", "active-gs-online", "fisherrf", "gauss-mi")
+            for policy in (
+                REFERENCE,
+                "r3-pano",
+                "gavis",
+                "active-gs-online",
+                "fisherrf",
+                "gauss-mi",
+            )
             for mode, loop in MODES.items()
         },
     },
