@@ -601,11 +601,12 @@ def _cloud(images: PosedImages) -> tuple[np.ndarray, np.ndarray]:
         beside = (
             "" if model is None else f"; the COLMAP model beside it has points: audit {model[0]}"
         )
-        absent = "" if images.has_images else f", and {images.image_paths[0]} is missing, too"
-        raise FormatError(
-            images.path,
-            f"{NO_SURFACES}{absent}{beside}",
+        absent = (
+            ""
+            if images.has_images
+            else f"; photos would do, but {images.image_paths[0]} is missing: copy them there"
         )
+        raise FormatError(images.path, f"{NO_SURFACES}{absent}{beside}")
     if len(xyz) > _MAX_POINTS:
         chosen = np.random.default_rng(0).choice(len(xyz), _MAX_POINTS, replace=False)
         xyz, rgb = xyz[chosen], rgb[chosen]

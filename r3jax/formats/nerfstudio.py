@@ -30,7 +30,7 @@ from r3jax.files import write_atomic
 from r3jax.formats.depth import DepthUnit
 from r3jax.formats.errors import naming
 from r3jax.formats.lenses import DUAL_FISHEYE, PANORAMA, Lens
-from r3jax.formats.posed_images import COPIES, IMAGE_FORMATS, PosedImages, find_mask
+from r3jax.formats.posed_images import FOLDERS, IMAGE_FORMATS, PosedImages, find_mask
 from r3jax.formats.poses import mend_pose
 from r3jax.runs.reader import Run
 from r3jax.validation.errors import ForeignFileError
@@ -104,7 +104,7 @@ def read_transforms(path: Path | str) -> PosedImages:
         if not frames:
             raise ForeignFileError("it lists no frames")
         images = [_image(path.parent, i, frame) for i, frame in enumerate(frames)]
-        images = _smaller_copies(path.parent, images)
+        images = _moved(path.parent, images)
         points = content.get("ply_file_path")
         check_type("ply_file_path", points, str | None)
         points_path = None if points is None else below(path.parent, points)
@@ -171,14 +171,14 @@ def _missing_masks(masks: list[Path | None]) -> str | None:
     return f"{len(gone)} of {len(masks)} masks are missing ({gone[0]}): nothing is masked there."
 
 
-def _smaller_copies(folder: Path, images: list[Path]) -> list[Path]:
-    """Finds the copies in images_2, images_4 or images_8 if all images are missing."""
-    if folder in {image.parent for image in images} or any(map(os.path.exists, images)):
+def _moved(folder: Path, images: list[Path]) -> list[Path]:
+    """Finds the images in another of the usual folders if all are missing where the file says."""
+    if any(map(os.path.exists, images)) or len({image.name for image in images}) < len(images):
         return images
-    for copy in COPIES:
-        copies = [p.parent.with_name(p.parent.name + copy) / p.name for p in images]
-        if any(map(os.path.exists, copies)):
-            return copies
+    for name in FOLDERS:
+        others = [folder / name / image.name for image in images]
+        if any(map(os.path.exists, others)):
+            return others
     return images
 
 

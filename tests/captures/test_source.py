@@ -3,6 +3,7 @@
 Sparse depth from points: each where the camera shows it, and nothing that is hidden.
 """
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -230,3 +231,14 @@ def test_poses_that_are_placeholders_are_refused(tmp_path):
     same = np.repeat(images.poses[:1], len(images), axis=0)
     with pytest.raises(FormatError, match="poses of all 16 images are equal"):
         source_of(replace(images, poses=same), "room")
+
+
+def test_photos_that_are_not_where_the_file_says_are_named(tmp_path):
+    path = write_nerfstudio(tmp_path, round_poses(), depth=True)
+    content = json.loads((path / "transforms.json").read_text())
+    for frame in content["frames"]:
+        del frame["depth_file_path"]
+        frame["file_path"] = frame["file_path"].replace("images", "frames").replace("0", "1")
+    (path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(FormatError, match=r"photos would do, but .*frames/111\.png is missing"):
+        source_of(read_transforms(path), "room")

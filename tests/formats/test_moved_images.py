@@ -76,6 +76,26 @@ def test_the_intrinsics_follow_images_that_were_scaled(model):
     assert f"{WIDTH} x {HEIGHT}" in images.remark
 
 
+@pytest.mark.parametrize("name", ["input", "images_8", "."])
+def test_the_images_of_a_transforms_json_are_found_there_too(tmp_path, name):
+    """Seen in a public repository: 302 pictures beside the file that says images/."""
+    path = write_nerfstudio(tmp_path / "scan", POSES, depth=True)
+    expected = opened(path).rgb(2)
+    (path / name).mkdir(exist_ok=True)
+    for image in (path / "images").iterdir():
+        image.rename(path / name / image.name)
+    np.testing.assert_array_equal(opened(path).rgb(2), expected)
+
+
+def test_images_of_one_name_in_two_folders_are_not_confused(tmp_path):
+    path = write_nerfstudio(tmp_path / "scan", POSES[:2], depth=True)
+    told = (path / "transforms.json").read_text()
+    told = told.replace("images/000.png", "left/0.png").replace("images/001.png", "right/0.png")
+    (path / "transforms.json").write_text(told)
+    (path / "images" / "000.png").rename(path / "0.png")
+    assert not opened(path).has_images
+
+
 @pytest.mark.parametrize("folder", ["images", "images_4"])
 def test_so_do_those_of_a_transforms_json(tmp_path, folder):
     path = write_nerfstudio(tmp_path / "scan", POSES, depth=True)
