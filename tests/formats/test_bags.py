@@ -31,6 +31,7 @@ from tests.formats.bags import (
     camera_poses,
     depth_fields,
     image,
+    messages,
     moved,
     packed,
     write_bag,
@@ -225,6 +226,13 @@ def test_a_bag_that_lacks_something_says_what_to_record(tmp_path, damage):
     with pytest.raises(FormatError, match=message) as found:
         open_capture(path)
     assert str(path) in str(found.value)
+
+
+def test_a_bag_of_nothing_that_can_be_read_says_so(tmp_path):
+    everything = tuple({sent.topic for sent in messages(Robot())})
+    path = write_bag(tmp_path / "drive", Robot(leave_out=everything, service=True))
+    with pytest.raises(FormatError, match=r"no color images .* in it, nor any message .* parsed: "):
+        open_capture(path)
 
 
 @pytest.mark.parametrize("lost", [1, 1000])

@@ -46,7 +46,7 @@ def check_topics(bag: AnyBag, topics: Topics) -> None:
     for key in ("color", "depth", "info", "depth_info", "pose"):
         name = getattr(topics, key)
         if name is not None and name not in bag.types:
-            raise FormatError(bag.path, f"there is no topic {name} in it, only {_listed(bag)}")
+            raise FormatError(bag.path, f"there is no topic {name} in it, {_listed(bag)}")
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def find_images(bag: AnyBag, topics: Topics) -> tuple[ImageTopic, ImageTopic]:
             )
             raise FormatError(
                 bag.path,
-                f"there are no {kind} images ({what}) in it, only {_listed(bag)}: record them, too",
+                f"there are no {kind} images ({what}) in it, {_listed(bag)}: record them, too",
             )
     pairs = [(_likeness(color, depth), color, depth) for color in colors for depth in depths]
     _, color, depth = max(pairs, key=lambda pair: pair[0])
@@ -138,10 +138,11 @@ def find_pose(bag: AnyBag) -> str | None:
 
 
 def _listed(bag: AnyBag) -> str:
-    """Lists some topics and their types, in words."""
+    """Lists some topics and their types, in part of a sentence."""
     shown = [f"{name} ({kind.rpartition('/')[2]})" for name, kind in sorted(bag.types.items())]
     more = f" and {len(shown) - 12} more" if shown[12:] else ""
-    return (", ".join(shown[:12])[:1000] or "nothing") + more + not_parsed(bag)
+    listed = f"only {', '.join(shown[:12])[:1000]}" if shown else "nor any message that can be read"
+    return listed + more + not_parsed(bag)
 
 
 def not_parsed(bag: AnyBag) -> str:
