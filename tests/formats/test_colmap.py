@@ -187,6 +187,30 @@ def test_the_place_is_named_where_pictures_would_join_two_models(tmp_path, alike
     assert len(read_colmap(tmp_path / "sparse")) == 7  # the folder of the models
 
 
+def test_a_larger_model_that_was_not_undistorted_is_named(tmp_path):
+    """Seen in a public repository: convert.py undistorted a model of 3 pictures; 1 has 44."""
+    names = [f"{i:02d}.png" for i in range(9)]
+    (tmp_path / "images").mkdir()
+    for name in names:
+        Image.new("RGB", (40, 30)).save(tmp_path / "images" / name)
+    parts = {
+        "sparse/0": names[:2],
+        "distorted/sparse/0": names[:2],
+        "distorted/sparse/1": names[2:],
+    }
+    for place, part in parts.items():
+        (tmp_path / place).mkdir(parents=True)
+        write_binary(tmp_path / place, part_of(part))
+    images = read_colmap(tmp_path)
+    assert len(images) == 2
+    assert images.remark is not None
+    assert f"{tmp_path / 'distorted/sparse/1'} has 7 pictures" in images.remark
+    assert "no model has" not in images.remark
+    assert len(read_colmap(tmp_path / "distorted/sparse/1")) == 7
+    (tmp_path / "distorted/sparse/1/images.bin").write_bytes(b"")  # damaged: only not named
+    assert "no model has 02.png" in str(read_colmap(tmp_path).remark)
+
+
 def test_pictures_without_a_pose_are_counted(capture):
     (capture / "images").mkdir()
     assert read_colmap(capture).remark is None

@@ -156,7 +156,7 @@ def read_colmap(path: Path | str, images: Path | str | None = None) -> PosedImag
         poses=np.stack([pose_of(image.quaternion, image.translation) for image in ordered]),
         depth_paths=tuple(depths),
         points=_sparse_points(model.points, {image.id: i for i, image in enumerate(ordered)}),
-        remark=_left_out(folder, models, unposed, Path(found)),
+        remark=_left_out(folder, models, _larger(path, folder, model), unposed, Path(found)),
         mask_paths=tuple(masks) if any(masks) else None,
         is_stereo=any(depth is not None for depth in depths),
         reconstruction=reconstruction_of(model, len(unposed)),
@@ -230,9 +230,25 @@ def _has_images(folder: Path) -> bool:
     return any((folder / f"images{suffix}").exists() for suffix in (".bin", ".txt"))
 
 
+def _larger(path: Path, folder: Path, model: ColmapModel) -> dict[Path, ColmapModel]:
+    """Reads the models that gaussian-splatting left in distorted/ and that have more pictures.
+
+    Its converter undistorts only the first one, whatever the mapper has put there.
+    """
+    first = path / "distorted" / "sparse" / "0"
+    if not os.path.isdir(first.parent) or first.parent.resolve() in folder.resolve().parents:
+        return {}
+    found: dict[Path, ColmapModel] = {}
+    for part in _numbered(first):
+        with suppress(FormatError):  # damaged, and not needed here
+            found[part] = read_model(part)
+    return {part: one for part, one in found.items() if len(one.images) > len(model.images)}
+
+
 def _left_out(
     folder: Path,
     models: Mapping[Path, ColmapModel],
+    larger: Mapping[Path, ColmapModel],
     unposed: Sequence[Path],
     images: Path,
 ) -> str | None:
@@ -250,8 +266,16 @@ def _left_out(
     if len(models) > 1:
         names = {image.name for model in models.values() for image in model.images}
         said += _other_models(folder, models, {name: below(images, name) for name in names})
+    if larger:
+        best = max(larger, key=lambda part: len(larger[part].images))
+        said.append(
+            f"{best} has {len(larger[best].images)} pictures, but gaussian-splatting's convert.py "
+            "undistorts only the model 0 beside it: give this one the number 0 and run convert.py "
+            f"--skip_matching again, or audit {best}"
+        )
     if unposed:
-        names = {image.name for model in models.values() for image in model.images}
+        known = (*models.values(), *larger.values())
+        names = {image.name for model in known for image in model.images}
         said += _nowhere([path.name for path in unposed if path.name not in names])
     broken = [part.name for part in _numbered(folder) if not _has_images(part)]
     if broken:
