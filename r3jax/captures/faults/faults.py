@@ -155,7 +155,10 @@ def find_faults(
     if len(images) < 2 and failed:
         raise next(iter(failed.values()))
     kept = np.setdiff1d(chosen, list(failed))
-    found = faults_of(images, kept, source.labels, source.is_metric, source.has_images, fits=fits)
+    found = faults_of(
+        images, kept, source.labels, source.is_metric, source.has_images,
+        is_measured=source.is_complete, fits=fits,
+    )  # fmt: skip
     left_out = {
         index: f"{printable(error.path.name)}: {error.reason}" for index, error in failed.items()
     }
@@ -195,6 +198,7 @@ def faults_of(
     is_metric: bool = True,
     has_colors: bool = True,
     *,
+    is_measured: bool = True,
     fits: bool = True,
 ) -> Faults:
     """Finds faults as `find_faults` does, from block images.
@@ -205,12 +209,14 @@ def faults_of(
         labels: names of all images of the capture.
         is_metric: True if a unit is a meter.
         has_colors: False if there are no real colors.
+        is_measured: True if depth is a depth camera's. Computed from the photos at these very poses
+            and lenses it has their errors, and says nothing about them.
         fits: False if depth and poses are known to contradict each other.
     """
     pairs = overlaps(images)
     poses = offsets(images, pairs)
     names = _Names(chosen, labels, "m" if is_metric else "u")
-    shared = poses.systematic
+    shared = poses.systematic if is_measured else None
     fits = fits and (shared is None or abs(shared.size) < _MISFIT)
     findings = [_systematic(shared), _pose(poses, images, names) if fits else None]
     record: dict[str, Any] = {"pictures": chosen.tolist(), "pose_off_by": _numbers(poses.distance)}

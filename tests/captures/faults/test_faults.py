@@ -155,6 +155,20 @@ def test_an_error_of_all_frames_is_named_and_measured(found, kind, value):
     assert (finding.kind, finding.value) == (kind, pytest.approx(value, abs=0.015))
 
 
+@pytest.mark.parametrize("factors", [(1.1, 1.0), (1.0, 1.25)])
+def test_depth_that_was_computed_at_the_poses_does_not_contradict_them(factors):
+    """Seen on a stranger's terrace with a view of the pyramids: an audit of photos said to start
+    again, with --depth-scale, which it refuses there."""
+    depth_scale, focal_scale = factors
+    c = CAMERA
+    lens = Camera(c.width, c.height, c.fx * focal_scale, c.fy * focal_scale, c.cx, c.cy)
+    images = [block_image(rgb, depth_scale * depth, lens, pose) for rgb, depth, pose in walk()]
+    assert not faults_of(images, np.arange(VIEWS), NAMES).fits
+    found = faults_of(images, np.arange(VIEWS), NAMES, is_measured=False)
+    assert found.fits
+    assert not {"scale", "camera", "ray"} & {finding.kind for finding in found.findings}
+
+
 def test_frames_that_repeat_each_other_are_found_with_what_they_repeat():
     pictures = list(walk())
     pictures[8:10] = [pictures[7]] * 2
