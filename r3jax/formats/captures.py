@@ -31,6 +31,7 @@ from r3jax.formats.ros.rtabmap import (
     read_rtabmap_database,
     read_rtabmap_export,
 )
+from r3jax.formats.sequences.llff import is_llff, read_llff
 from r3jax.formats.sequences.replica_slam import is_replica_slam, read_replica_slam
 from r3jax.formats.sequences.scannet import is_scannet, is_sens, read_scannet, read_sens
 from r3jax.formats.sequences.seven_scenes import is_seven_scenes, read_seven_scenes
@@ -56,6 +57,7 @@ _FORMATS: tuple[tuple[Callable[[Path], bool], Callable[[Path], PosedImages]], ..
     (is_rtabmap_export, read_rtabmap_export),
     (is_rtabmap_database, read_rtabmap_database),
     (is_bag, read_bag),
+    (is_llff, read_llff),
 )
 """Formats of posed images: a test for each, and its reader."""
 
@@ -66,8 +68,8 @@ _KNOWN = (
     "recording of Record3D (.r3d, or EXR_RGBD/) or Stray Scanner (rgb.mp4, odometry.csv), a "
     "scene of ARKitScenes (lowres_wide.traj), ScanNet (.sens, or color/, depth/, pose/, "
     "intrinsic/), Replica-SLAM (traj.txt, results/), TUM (rgb.txt, depth.txt, groundtruth.txt) or "
-    "7-Scenes (frame-*.color.png), a ROS bag (.bag, .mcap, .db3, or metadata.yaml), "
-    "RTAB-Map (.db, or *_camera_poses.txt)"
+    "7-Scenes (frame-*.color.png), LLFF (poses_bounds.npy), a ROS bag (.bag, .mcap, .db3, or "
+    "metadata.yaml), RTAB-Map (.db, or *_camera_poses.txt)"
 )
 
 _COMMON_NAME = re.compile(r"\d+|sparse|dense|colmap|undistorted|raw|seq-?\d+", re.IGNORECASE)

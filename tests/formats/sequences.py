@@ -1,4 +1,4 @@
-"""Tiny sequences in the layouts of Replica-SLAM, TUM and 7-Scenes, in memory."""
+"""Tiny sequences in the layouts of Replica-SLAM, TUM, 7-Scenes and LLFF, in memory."""
 
 import io
 import json
@@ -80,4 +80,20 @@ def seven_scenes() -> dict[str, bytes]:
         files[f"frame-{i:06d}.depth.png"] = encoded(np.kron(steps, np.ones((60, 64), np.uint16)))
         lines = ["\t".join(f"{x:.7e}" for x in row) for row in pose]
         files[f"frame-{i:06d}.pose.txt"] = "\n".join(lines).encode()
+    return files
+
+
+def llff() -> dict[str, bytes]:
+    """Axes down, right, backward; the size of the images that COLMAP had; copies of half of it."""
+    rows = [
+        [*np.column_stack([T[:3, 1], T[:3, 0], -T[:3, 2], T[:3, 3], [HEIGHT, WIDTH, 8.0]]).ravel(),
+         0.5, 4.0]
+        for T in poses()
+    ]  # fmt: skip
+    stored = io.BytesIO()
+    np.save(stored, np.array(rows))
+    files = {"poses_bounds.npy": stored.getvalue()}
+    for i in range(NUM):
+        files[f"images/IMG_{9699 + i}.JPG"] = encoded(pixels(i)[0], "jpeg")
+        files[f"images_2/IMG_{9699 + i}.png"] = encoded(pixels(i)[0][::2, ::2])
     return files

@@ -1,4 +1,4 @@
-"""Replica-SLAM, TUM and 7-Scenes: pixels, meters, poses and intrinsics as their pages say."""
+"""Replica-SLAM, TUM, 7-Scenes and LLFF: pixels, meters, poses and intrinsics as their pages say."""
 
 import io
 
@@ -11,6 +11,8 @@ from PIL import Image
 
 from r3jax.formats.captures import open_capture
 from r3jax.formats.errors import FormatError
+from r3jax.formats.lenses import Lens
+from r3jax.formats.sequences.llff import is_llff, read_llff
 from r3jax.formats.sequences.replica_slam import is_replica_slam, read_replica_slam
 from r3jax.formats.sequences.seven_scenes import is_seven_scenes, read_seven_scenes
 from r3jax.formats.sequences.tum import is_tum, nearest, read_tum
@@ -22,6 +24,7 @@ READERS = {
     "replica_slam": (is_replica_slam, read_replica_slam),
     "tum": (is_tum, read_tum),
     "seven_scenes": (is_seven_scenes, read_seven_scenes),
+    "llff": (is_llff, read_llff),
 }
 
 
@@ -120,6 +123,32 @@ def test_seven_scenes_has_two_numbers_for_no_measurement(tmp_path):
     np.testing.assert_array_equal(np.asarray(depth)[30, [32, 96]], 0.0)
     np.testing.assert_allclose(np.asarray(depth)[30::60, 32::64][1:], steps[1:] / 1000, rtol=1e-6)
     assert images.lenses[0].params == (585.0, 585.0, 320.0, 240.0)
+
+
+def test_llff_has_one_image_for_each_pose(tmp_path):
+    lay_out(tmp_path, sequences.llff())
+    images = read_llff(tmp_path)
+    assert images.lenses[0] == Lens("PINHOLE", WIDTH, HEIGHT, (8.0, 8.0, WIDTH / 2, HEIGHT / 2))
+    (tmp_path / "images" / "IMG_9700.JPG").unlink()
+    smaller = open_capture(tmp_path).source
+    assert smaller.image_paths[1] == tmp_path / "images_2" / "IMG_9700.png"
+    assert smaller.lenses[1].intrinsics == (4.0, 4.0, WIDTH / 4, HEIGHT / 4)
+    (tmp_path / "images_2" / "IMG_9700.png").unlink()
+    with pytest.raises(FormatError, match=r"3 poses, but .*images has 2, .*images_2 has 2"):
+        read_llff(tmp_path)
+
+
+@pytest.mark.parametrize("damage", ["shape", "nan", "focal"])
+def test_llff_that_is_damaged_is_refused(tmp_path, damage):
+    files = sequences.llff()
+    table = np.load(io.BytesIO(files["poses_bounds.npy"]))
+    table = table[:, :15] if damage == "shape" else table
+    table[1, 14 if damage == "focal" else 2] = np.nan if damage == "nan" else 0.0
+    stored = io.BytesIO()
+    np.save(stored, table)
+    lay_out(tmp_path, files | {"poses_bounds.npy": stored.getvalue()})
+    with pytest.raises(FormatError, match=r"poses_bounds\.npy"):
+        read_llff(tmp_path)
 
 
 times = hnp.arrays(np.float64, st.integers(1, 12), elements=st.floats(0, 1, width=32))

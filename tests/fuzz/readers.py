@@ -53,6 +53,7 @@ from r3jax.formats.posed_images import PosedImages
 from r3jax.formats.recordings import read_recording
 from r3jax.formats.ros.bag_reader import read_bag
 from r3jax.formats.ros.rtabmap import read_rtabmap_database, read_rtabmap_export
+from r3jax.formats.sequences.llff import read_llff
 from r3jax.formats.sequences.replica_slam import read_replica_slam
 from r3jax.formats.sequences.scannet import read_scannet, read_sens
 from r3jax.formats.sequences.seven_scenes import read_seven_scenes
@@ -292,6 +293,7 @@ CAPTURES = {
     "replica slam": capture(read_replica_slam, sequences.replica_slam, cases=80),
     "tum": capture(read_tum, sequences.tum, cases=80),
     "seven scenes": capture(read_seven_scenes, sequences.seven_scenes, cases=80),
+    "llff": capture(read_llff, sequences.llff, cases=80),
     "bag mcap": capture(one_file(read_bag, "drive"), bag("mcap"), cases=100),
     "bag db3": capture(one_file(read_bag, "drive"), bag("db3"), cases=100),
     "bag": capture(read_bag, bag("bag"), cases=100),
