@@ -8,7 +8,8 @@ much as a dozen of independent ones.
 
 S: floors and tables face up, ceilings down, walls to the side, and other surfaces anywhere: a
 mixture for each normal of the depth images. A plane has many normals but is one observation, so
-their mean counts as much as a few for each distinct direction (the exponential of the entropy).
+their mean counts as much as a few for each distinct direction (the exponential of the entropy), and
+no more than in a furnished room: the leaves of trees face all directions and say little.
 
 The estimate is the maximum; "within" is the angle round it that holds 95 % of the posterior.
 
@@ -55,8 +56,8 @@ _FACING_UP, _FACING_DOWN, _UPRIGHT = 0.25, 0.12, 0.33
 _EVEN = np.radians(3.0)
 """Standard deviation of floors and walls from their ideals [rad]."""
 
-_PER_PLANE = 1.5
-"""Observations that each distinct direction of surfaces counts for."""
+_PER_PLANE, _MOST_PLANES = 1.5, 12.0
+"""Observations that each distinct direction of surfaces counts for, and the most of all."""
 
 _LATTICE, _BINS = 3000, 200
 """Directions that are tried, and bins in which directions count as distinct."""
@@ -209,7 +210,7 @@ def _thinned(seen: Sequence[Normals]) -> Normals:
     if len(weight) > _USED_NORMALS:
         chosen = np.random.default_rng(0).choice(len(weight), _USED_NORMALS, replace=False)
         direction, weight, error = direction[chosen], weight[chosen], error[chosen]
-    count = min(_PER_PLANE * _distinct(direction, weight), len(weight) / 3.0)
+    count = min(_PER_PLANE * _distinct(direction, weight), _MOST_PLANES, len(weight) / 3.0)
     return Normals(direction, weight * (count / weight.sum()), error)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from r3jax.captures.vertical import Vertical, block_normals, estimated_up
+from r3jax.captures.vertical import Normals, Vertical, block_normals, estimated_up
 from r3jax.geometry.cameras import Camera
 from tests.apps.audit import held
 from tests.apps.audit.held import held_pose, turned
@@ -50,6 +50,24 @@ def test_cameras_alone_say_up_where_they_turn_round_and_how_little_they_say_wher
     doubtful = estimated_up(turned(np.stack(one_way), R))
     assert doubtful.within is not None
     assert max(15.0, error(doubtful, R[:, 2])) < doubtful.within
+
+
+def test_a_facade_among_trees_is_not_the_floor():
+    """Seen in five public photos of South Building: up was said to be its facade's normal, within
+    5 degrees, as leaves in all directions made surfaces count for more than the cameras."""
+    rng = np.random.default_rng(0)
+    facade = np.array([-0.5, 0.87, 0.0])
+    leaves = rng.normal(size=(375, 3))
+    leaves /= np.linalg.norm(leaves, axis=1, keepdims=True)
+    normals = Normals(
+        np.concatenate([np.tile(facade / np.linalg.norm(facade), (125, 1)), leaves]),
+        np.ones(500),
+        np.full(500, np.radians(1.0)),
+    )
+    poses = np.stack([held_pose([0, 0, 1], a, 8, rng.normal()) for a in (0, 2, 4, 9, 10)])
+    found = estimated_up(poses, [normals])
+    assert found.within is not None
+    assert error(found, np.array([0.0, 0.0, 1.0])) < min(20.0, found.within)
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
