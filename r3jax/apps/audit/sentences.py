@@ -10,6 +10,7 @@ from r3jax.apps.audit.audit import SATURATED, Audit
 from r3jax.apps.audit.diagnosis import FEW, FINE, NOT_KNOWN
 from r3jax.apps.audit.suggest import DIRECTIONS, OVERLAP, Suggestion, promise, random_promise
 from r3jax.captures.alignment import AXES
+from r3jax.captures.survey import Survey
 
 MEANING = {
     "fine": f"seen well enough: R ≥ {FINE:g} from where a person would stand",
@@ -101,6 +102,9 @@ _MOST_SAID = 4
 _DOUBTFUL = 5.0
 """An estimated vertical with a larger uncertainty is mentioned first [deg]."""
 
+_COARSE, _VIEWED = 0.25, 10.0
+"""Voxels that are coarse, and the range that is advised then [median depths]."""
+
 _MOST_NAMED = 6
 """Maximum number of unreadable pictures named in a sentence."""
 
@@ -151,7 +155,7 @@ def verdict(audit: Audit) -> list[str]:
     first = int(audit.survey.is_one_place)  # this one stays first
     if (audit.survey.up.within or 0.0) > _DOUBTFUL:
         sentences.insert(first, vertical(audit))
-    sentences[first:first] = [*unread(audit), *without_depth(audit)]
+    sentences[first:first] = [*coarse(audit.survey), *unread(audit), *without_depth(audit)]
     if audit.source.remark is not None:
         sentences.insert(first, audit.source.remark)
     if audit.survey.doubt is not None:
@@ -175,9 +179,23 @@ def verdict(audit: Audit) -> list[str]:
 
 
 def first_things(audit: Audit) -> list[str]:
-    """Lists remarks to show before the verdict: pictures that were left out of it."""
+    """Lists remarks to show before the verdict: pictures and surfaces that were left out of it."""
     remark = audit.source.remark
-    return [*([] if remark is None else [remark]), *unread(audit), *without_depth(audit)]
+    said = [*coarse(audit.survey), *unread(audit), *without_depth(audit)]
+    return said if remark is None else [remark, *said]
+
+
+def coarse(survey: Survey) -> list[str]:
+    """Warns that what is near is a few voxels, where the pictures have a view into the distance."""
+    voxel = survey.length(survey.voxel_size)
+    if voxel < _COARSE * survey.median_depth:
+        return []
+    return [
+        f"A voxel is {voxel:.2g} {survey.unit} wide, since some surfaces are "
+        f"{survey.far_depth:.2g} {survey.unit} away, but half of all that is seen is within "
+        f"{survey.median_depth:.2g} {survey.unit}: what is near is not judged. "
+        f"--max-range {_VIEWED * survey.median_depth:.2g} judges it, and not the distance."
+    ]
 
 
 def _surfaces(audit: Audit) -> str:
