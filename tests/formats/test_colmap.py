@@ -187,6 +187,22 @@ def test_the_place_is_named_where_pictures_would_join_two_models(tmp_path, alike
     assert len(read_colmap(tmp_path / "sparse")) == 7  # the folder of the models
 
 
+def test_pictures_that_were_not_undistorted_have_no_pose(tmp_path):
+    """Seen in a public repository: input/ has 40 pictures, images/ the 3 of the model."""
+    names = [f"{i:02d}.png" for i in range(5)]
+    for place, some in (("images", names[:2]), ("input", names)):
+        (tmp_path / place).mkdir()
+        for name in some:
+            Image.new("RGB", (40, 30)).save(tmp_path / place / name)
+    (tmp_path / "sparse/0").mkdir(parents=True)
+    write_binary(tmp_path / "sparse/0", part_of(names[:2]))
+    images = read_colmap(tmp_path)
+    assert "only 2 of 5 have a pose" in str(images.remark)
+    assert "no model has 02.png, 03.png, 04.png" in str(images.remark)
+    assert images.reconstruction is not None
+    assert images.reconstruction.pictures == 5
+
+
 def test_a_larger_model_that_was_not_undistorted_is_named(tmp_path):
     """Seen in a public repository: convert.py undistorted a model of 3 pictures; 1 has 44."""
     names = [f"{i:02d}.png" for i in range(9)]

@@ -203,10 +203,19 @@ def _stereo_depth(dense: Path | None, name: str) -> Path | None:
 
 
 def _unposed(posed: set[Path]) -> list[Path]:
-    """Lists pictures beside those of a model, in the order of their names."""
+    """Lists pictures beside those of a model, in the order of their names.
+
+    COLMAP's undistorter writes only the pictures with a pose; gaussian-splatting keeps all of them
+    in input/.
+    """
     suffixes = {path.suffix for path in posed}
-    beside = {file for place in {path.parent for path in posed} for file in _files(place)}
-    return sorted(file for file in beside - posed if file.suffix in suffixes)
+    places = {path.parent for path in posed}
+    beside = {file for place in places for file in _files(place)} - posed
+    for place in places:
+        if place.name == "images":
+            taken = {file.name for file in posed | beside if file.parent == place}
+            beside |= {f for f in _files(place.with_name("input")) if f.name not in taken}
+    return sorted(file for file in beside if file.suffix in suffixes)
 
 
 def _parts(path: Path, folder: Path) -> list[Path]:
