@@ -72,7 +72,7 @@ _KNOWN = (
     "metadata.yaml), RTAB-Map (.db, or *_camera_poses.txt)"
 )
 
-_COMMON_NAME = re.compile(r"\d+|sparse|dense|colmap|undistorted|raw|seq-?\d+", re.IGNORECASE)
+_COMMON_NAME = re.compile(r"\d+|sparse|dense|colmap|undistorted|raw|data|seq-?\d+", re.IGNORECASE)
 """Common folder names, which do not identify a capture."""
 
 _MOST_BELOW = 100

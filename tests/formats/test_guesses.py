@@ -67,6 +67,11 @@ FOLDERS = {
 }
 
 
+def test_a_capture_of_a_common_name_is_named_after_its_parents_too(tmp_path):
+    lay_out(tmp_path / "walk" / "data" / "seq-01", sequences.seven_scenes())
+    assert open_capture(tmp_path / "walk" / "data" / "seq-01").name == "walk-data-seq-01"
+
+
 @pytest.mark.parametrize("name", FOLDERS)
 def test_a_folder_that_is_not_understood_gets_a_guess(tmp_path, name):
     files, message = FOLDERS[name]

@@ -397,10 +397,10 @@ def _notes(found: Selected, targets: Targets, num_unread: int) -> tuple[str, ...
             "All frames are blurred or upscaled: hardly any of them has pixel-sized detail. The "
             "best of them are kept; only a new capture would be sharper."
         )
-    blurred = found.quality.is_blurred
-    if blurred[found.choice.order].any():
+    blurred = int(found.quality.is_blurred[found.choice.order].sum())
+    if blurred:
         notes.append(
-            f"{int(blurred[found.choice.order].sum())} of the frames kept are blurred: each gained "
+            f"{blurred} of the frames kept {'is' if blurred == 1 else 'are'} blurred: each gained "
             "more than any sharp frame when it was chosen."
         )
     outside = int((targets.coverage < _OUTSIDE).sum())
