@@ -1,5 +1,9 @@
 """Sequences of depth cameras as people hand them on."""
 
+import io
+
+import numpy as np
+
 from tests.formats.real.layouts import NUM, POSES, Files, Layout, depth_png, picture, quaternion
 
 KINECT = (640, 480)
@@ -55,6 +59,22 @@ def _replica() -> Files:
     return files
 
 
+def _llff() -> Files:
+    """imgs2poses.py: names of a camera, masks under names of their own, copies of an eighth."""
+    stored = io.BytesIO()
+    table = [
+        np.append(np.column_stack([T[:3, 1], T[:3, 0], -T[:3, 2], T[:3, 3], (48, 64, 70)]), (1, 9))
+        for T in POSES
+    ]
+    np.save(stored, np.stack(table))
+    files: Files = {"poses_bounds.npy": stored.getvalue(), "LICENSE.md": b""}
+    for i, number in enumerate((9669, 9670, 9672)):
+        files[f"images/IMG_{number}.JPG"] = picture(i, (64, 48))
+        files[f"images_8/IMG_{number}.png"] = picture(i, (8, 6), "png")
+        files[f"masks/IMG_{number}_mask.JPG"] = picture(i, (64, 48))
+    return files
+
+
 _Z = (0.0, 0.0, 1.0)
 _TUM = {"size": KINECT, "intrinsics": (525.0, 525.0, 320.0, 240.0), "poses_off": 2e-4, "up": _Z,
         "remark": ("K.txt",)}  # fmt: skip
@@ -67,6 +87,7 @@ LAYOUTS = (
            **_SEVEN),
     Layout("3DMatch, another camera", lambda: _seven_scenes(_K, "png"),
            intrinsics=(570.34, 571.34, 320.0, 240.0), **_SEVEN),
+    Layout("LLFF", _llff, size=(64, 48), intrinsics=(70.0, 70.0, 32.0, 24.0), has_depth=False),
     Layout("Replica of NICE-SLAM", _replica, size=(64, 48), intrinsics=(70.0, 70.0, 32.0, 24.0),
            up=_Z),
 )  # fmt: skip
