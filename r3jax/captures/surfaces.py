@@ -86,7 +86,9 @@ def with_surfaces(
         if why is None:
             return found
     if source.kind == "photos":
-        raise InputError(f"{source.name}: {NO_SURFACES}; no depth can be computed from them: {why}")
+        raise InputError(
+            f"{source.name}: {NO_SURFACES}; no depth can be computed from the photos: {why}"
+        )
     if wanted == "sweep":
         raise InputError(f"{source.name}: no depth can be computed from its photos: {why}")
     return source if source.reconstruction is None else _remarked(source, why)
@@ -332,7 +334,10 @@ def _failed(source: Source, found: Source) -> str | None:
         off.append(_off(depth, found, index, points_shown(source, index)))
     share = np.mean(kept) / _unmasked(found)
     if share < _LEAST_KEPT:
-        return f"the photos agree on only {100 * share:.1f} % of their pixels"
+        return (
+            f"the photos agree on only {100 * share:.1f} % of their pixels, so surfaces are plain, "
+            "or poses and focal lengths do not fit them"
+        )
     ratio = np.concatenate(off)
     median = float(np.median(np.abs(ratio))) if len(ratio) else 0.0
     if median > _CONTRADICTED:
