@@ -249,6 +249,8 @@ def _larger(path: Path, folder: Path, model: ColmapModel) -> dict[Path, ColmapMo
         return {}
     found: dict[Path, ColmapModel] = {}
     for part in _numbered(first):
+        if part == first:
+            continue
         with suppress(FormatError):  # damaged, and not needed here
             found[part] = read_model(part)
     return {part: one for part, one in found.items() if len(one.images) > len(model.images)}
