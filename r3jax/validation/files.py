@@ -126,12 +126,13 @@ def below(folder: Path, name: str) -> Path:
     """Finds a file in `folder` as the computer that wrote its name may have spelled it.
 
     Where there is no such file, backslashes count as slashes, an ending may be of the other case
-    (.PNG for .png), and of an absolute path that part counts which leads to a file in the folder.
+    (.PNG for .png), and of an absolute path, or one with steps upwards, that part counts which
+    leads to a file in the folder.
 
     Raises:
         ForeignFileError: see `check_relative`.
     """
-    is_plain = "\\" not in name and not _is_absolute(name)
+    is_plain = "\\" not in name and ".." not in name and not _is_absolute(name)
     if not is_plain and "\0" not in name and len(name) <= _LONGEST:
         name = _respelled(folder, name)
     return _namesake(folder.joinpath(*check_relative(name).parts))
@@ -143,13 +144,13 @@ def _is_absolute(name: str) -> bool:
 
 
 def _respelled(folder: Path, name: str) -> str:
-    """Converts a name of Windows, or an absolute one, to that of a file in the folder."""
+    """Converts a name of Windows, or one that leads elsewhere, to that of a file in the folder."""
     parts = PureWindowsPath(name).parts
-    if ".." in parts or os.path.exists(folder / name.lstrip("/")):
+    if os.path.exists(folder / name.lstrip("/")):
         return name
-    if not _is_absolute(name):
+    if not _is_absolute(name) and ".." not in parts:
         return "/".join(parts)
-    tails = ("/".join(parts[i:]) for i in range(1, len(parts)))
+    tails = ("/".join(parts[i:]) for i in range(1, len(parts)) if ".." not in parts[i:])
     return next((tail for tail in tails if os.path.exists(_namesake(folder / tail))), name)
 
 

@@ -102,6 +102,9 @@ def test_names_that_are_refused(name, reason):
         ("images\\2.jpg", "images/2.JPG"),
         ("C:\\Users\\me\\scan\\images\\1.png", "images/1.png"),
         ("/home/me/scan/images/1.PNG", "images/1.png"),
+        ("../images/1.png", "images/1.png"),
+        ("..\\scan\\images\\1.png", "images/1.png"),
+        ("images/../../scan/images/1.png", "images/1.png"),
         ("a\\b.png", "a\\b.png"),  # a name of this system
         ("images\\gone.png", "images/gone.png"),
     ],
@@ -114,8 +117,13 @@ def test_names_as_other_computers_spell_them(tmp_path, name, found):
 
 
 @pytest.mark.parametrize(
-    "name", ["C:\\x\\gone.png", "C:/x/gone.png", "/images/../x.png", "\\\\a\\b"]
+    "name",
+    ["C:\\x\\gone.png", "C:/x/gone.png", "/images/../x.png", "\\\\a\\b", "../beside/images/1.png"],
 )
-def test_absolute_names_that_lead_nowhere_are_refused(tmp_path, name):
+def test_names_that_lead_elsewhere_are_refused(tmp_path, name):
+    (tmp_path / "beside" / "images").mkdir(parents=True)
+    (tmp_path / "beside" / "images" / "1.png").touch()
+    tmp_path = tmp_path / "capture"
+    tmp_path.mkdir()
     with pytest.raises(ForeignFileError, match=r"absolute path|leads out"):
         below(tmp_path, name)
