@@ -82,6 +82,11 @@ class Lattice:
         x, y, z = (n * c for n, c in zip(self.num, self.cells, strict=True))
         return x, y, z
 
+    @property
+    def size(self) -> np.ndarray:
+        """Edges of the block at hand [m], [3]."""
+        return np.array(self.shape) * self.cell_size
+
     def corner(self, middle: Tile) -> np.ndarray:
         """Computes the lower corner of the block round a tile [m], [3]."""
         first = np.array(middle) - np.array(self.num) // 2
@@ -133,7 +138,7 @@ def longest_ray(camera: Camera) -> float:
 
 def capacity_for(lattice: Lattice, voxel_size: float) -> int:
     """Chooses the rows at hand, a power of two: `VOXELS_PER_AREA` over all floors, at 70 %."""
-    x, y, z = lattice.edge * np.array(lattice.num)
+    x, y, z = lattice.size
     stories = max(1, round(z / STORY)) if lattice.num[2] == 1 else 1
     rows = VOXELS_PER_AREA * x * y * stories / voxel_size**2 / MAX_LOAD
     return 1 << max(12, math.ceil(math.log2(rows)))

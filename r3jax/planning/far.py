@@ -448,8 +448,7 @@ def _at_hand(far: Far, positions: np.ndarray, middle: Tile) -> np.ndarray:
     """Finds which positions [v, 3] goals may have in the block round a tile, [v] bool."""
     lattice = far.tiles.lattice
     low = lattice.corner(middle)
-    size = np.array(lattice.shape) * lattice.cell_size
-    is_in = (positions > low + far.border) & (positions < low + size - far.border)
+    is_in = (positions > low + far.border) & (positions < low + lattice.size - far.border)
     return np.all(is_in | (np.array(lattice.num) == 1), axis=1)
 
 
@@ -475,7 +474,7 @@ def _renewed(known: Known, policy: GreedyPolicy, middle: Tile, position: np.ndar
     if not len(both.path):
         return views
     here, lattice = np.eye(4), far.tiles.lattice
-    center = lattice.corner(far.tiles.middle) + 0.5 * np.array(lattice.shape) * lattice.cell_size
+    center = lattice.corner(far.tiles.middle) + 0.5 * lattice.size
     if len(old.path) or not _in_block(far, position[None])[0]:
         position = both.place[np.argmin(np.linalg.norm(both.place - center, axis=1))]
     here[:3, 3] = position

@@ -224,12 +224,11 @@ def take_in(planner: Planner, frame: Frame, *, donate: bool = False) -> Planner:
     known = planner.map_state, planner.grid
     map_state, grid = add_frame(*known, frame, planner.config, donate=donate)
     if planner.far is not None and map_state.capacity > before:
-        lattice, rows = planner.far.tiles.lattice, map_state.capacity
-        width, depth, _ = lattice.edge * np.array(lattice.num)
+        rows, (x, y, _) = map_state.capacity, planner.far.tiles.lattice.size
         warnings.warn(
             f"the table at hand grows from {before} to {rows} rows, for which everything is "
-            f"compiled: {int(map_state.num_occupied)} voxels lie in the {width:.0f} x {depth:.0f} "
-            f"m at hand; MappingConfig(capacity={rows}) begins with as many, and larger voxels, a "
+            f"compiled: {int(map_state.num_occupied)} voxels lie in the {x:.0f} x {y:.0f} m "
+            f"at hand; MappingConfig(capacity={rows}) begins with as many, and larger voxels, a "
             "shorter max_range or bounds that hold one floor make them fewer",
             stacklevel=3,
         )

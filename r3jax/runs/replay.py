@@ -385,8 +385,7 @@ class _Memory:
             trails = planner.far.trails[:0]
             return replace(self, far=replace(planner.far, tiles=empty, trails=trails))
         lattice, far = tiles.lattice, self.far.with_trail(self.state.trail)
-        size = np.array(lattice.shape) * lattice.cell_size
-        center = lattice.corner(tiles.middle) + 0.5 * size
+        center = lattice.corner(tiles.middle) + 0.5 * lattice.size
         layers = {"looks": self.state.looks}
         _, layers, kept = page(empty_map(2), layers, far.tiles, center)
         far = replace(far, tiles=kept)

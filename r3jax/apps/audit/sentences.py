@@ -155,9 +155,7 @@ def verdict(audit: Audit) -> list[str]:
     first = int(audit.survey.is_one_place)  # this one stays first
     if (audit.survey.up.within or 0.0) > _DOUBTFUL:
         sentences.insert(first, vertical(audit))
-    sentences[first:first] = [*coarse(audit.survey), *unread(audit), *without_depth(audit)]
-    if audit.source.remark is not None:
-        sentences.insert(first, audit.source.remark)
+    sentences[first:first] = first_things(audit)
     if audit.survey.doubt is not None:
         sentences.insert(0, f"Warning: these results are unreliable: {audit.survey.doubt}")
     if audit.faults.findings:
